@@ -1,0 +1,1 @@
+"""The networks: arch, layers, both families, op lists, checkpoints, export, metrics."""

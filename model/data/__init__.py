@@ -1,0 +1,1 @@
+"""Reading what data sets store: images, disparity maps, label maps."""

@@ -1,0 +1,115 @@
+"""The door to the disk: whole writes, checked reads."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from .errors import Rts2Error, UsageError
+
+Schema = TypeVar("Schema", bound=BaseModel)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; it becomes `path` only if the block succeeds.
+
+    The temporary keeps `path`'s suffix, because many writers choose their format by it.
+    """
+    try:
+        with NamedTemporaryFile(
+            dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix, delete=False
+        ) as handle:
+            temporary = Path(handle.name)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    try:
+        yield temporary
+        with temporary.open("rb+") as written:
+            os.fsync(written.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path` whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as indented JSON; NaN is refused, as JSON has none."""
+    write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def output_folder(path: Path) -> Path:
+    """`path`, created where missing and known to be writable."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=path, prefix=".writable."):
+            return path
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def existing_file(path: Path, what: str) -> Path:
+    """`path`, if it is a file; `what` names its role in the error."""
+    if not path.is_file():
+        found = "it is a folder" if path.is_dir() else "there is no such file"
+        raise UsageError(f"{what} must be a file: {path}: {found}")
+    return path
+
+
+def read_json(path: Path, schema: type[Schema], what: str) -> Schema:
+    """The JSON file at `path`, validated as `schema`. Errors name the first wrong field."""
+    try:
+        text = existing_file(path, what).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise Rts2Error(f"{what} cannot be read: {path}: {error}") from error
+    return parse_json(text, schema, f"{what} {path}")
+
+
+def parse_json(text: str, schema: type[Schema], what: str) -> Schema:
+    """JSON text validated as `schema`; `what` names its origin in the error."""
+    try:
+        return schema.model_validate_json(text)
+    except ValidationError as error:
+        raise Rts2Error(f"{what}: {first_fault(error)}") from error
+
+
+def first_fault(error: ValidationError) -> str:
+    """One line for a validation error: the field, the rule, and what was given."""
+    fault = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in fault["loc"]) or "the document"
+    given = repr(fault["input"])
+    given = given if len(given) <= 60 else given[:57] + "..."
+    message = fault["msg"].removeprefix("Value error, ")
+    more = error.error_count() - 1
+    return f"{field}: {message} (given: {given})" + (f", and {more} more faults" if more else "")
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _unwritable(path: Path, error: OSError) -> Rts2Error:
+    return Rts2Error(f"cannot write {path}: {error.strerror or error}; choose another --out")

@@ -1,0 +1,1 @@
+"""One file a runtime: load, run, say its version."""

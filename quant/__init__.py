@@ -1,0 +1,1 @@
+"""From a trained float graph to lower precision, with proof."""

@@ -1,0 +1,1 @@
+"""The space, the front, the pick, the report and the deployment bundle."""

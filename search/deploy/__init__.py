@@ -1,0 +1,1 @@
+"""The deployment bundle, one file a target."""

@@ -1,0 +1,26 @@
+"""What every test may use."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real samples that RTS2_DATA names; without it the test is skipped."""
+    folder = os.environ.get("RTS2_DATA")
+    if not folder:
+        pytest.skip("needs real images: set RTS2_DATA to their folder (see CONTRIBUTING.md)")
+    path = Path(folder)
+    assert path.is_dir(), f"RTS2_DATA names no folder: {path}"
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _one_seed() -> None:
+    """Random weights are the same in every run; torch is seeded only where it is in use."""
+    import sys
+
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
