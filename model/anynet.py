@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -19,7 +21,7 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 class Features(nn.Module):
     """A U-Net of 2c, 4c, 8c features at 1/4, 1/8, 1/16; the way up ends in the same widths."""
 
-    def __init__(self, c: int) -> None:
+    def __init__(self, c: int, stages: int) -> None:
         super().__init__()
         self.stem = nn.Sequential(nn.Conv2d(3, c, 3, padding=1), _conv(c, c, stride=2))
         self.down = nn.ModuleList(
@@ -27,7 +29,8 @@ class Features(nn.Module):
             for width in (c, 2 * c, 4 * c)
         )
         self.up = nn.ModuleList(
-            nn.Sequential(_conv(3 * width, width), _conv(width, width)) for width in (4 * c, 2 * c)
+            nn.Sequential(_conv(3 * width, width), _conv(width, width))
+            for width in (4 * c, 2 * c)[: stages - 1]
         )
 
     def forward(self, images: Tensor, stages: int) -> list[Tensor]:
@@ -52,7 +55,7 @@ class AnyNet(nn.Module):
     def __init__(self, arch: Arch) -> None:
         super().__init__()
         self.arch = arch
-        self.features = Features(arch.c)
+        self.features = Features(arch.c, arch.stages)
         self.regularize = nn.ModuleList(_six_convs(width) for width in arch.conv3d)
 
     def forward(self, left: Tensor, right: Tensor, stages: int | None = None) -> list[Stage]:
@@ -81,7 +84,7 @@ def _six_convs(width: int) -> nn.Sequential:
     return nn.Sequential(
         *(
             preactivated(nn.Conv3d(inputs, outputs, 3, padding=1, bias=False))
-            for inputs, outputs in zip(widths[:-1], widths[1:], strict=True)
+            for inputs, outputs in pairwise(widths)
         )
     )
 

@@ -15,6 +15,9 @@ Branches = Literal["disparity", "disparity+semantic", "full"]
 STRIDES = (16, 8, 4)
 """The resolution of stages 1, 2, 3 as a divisor of the image's (paper, section III-C)."""
 
+FACTORS = (8, 4, 2)
+"""Features of both embeddings at stages 1, 2, 3, in multiples of c (AnyNet's way up)."""
+
 RADIUS = 2
 """Residual volumes look this many planes to both sides (paper, section III-C)."""
 
@@ -83,7 +86,7 @@ class Arch(BaseModel):
         return self.d_max if stage == 0 else 2 * RADIUS + 1
 
     def up_to(self, stages: int | None) -> Arch:
-        """This arch stopped early after `stages` stages (all of them for None)."""
+        """The arch stopped early after `stages` stages (all of them for None)."""
         if stages is None:
             return self
         if not 1 <= stages <= self.stages:

@@ -7,12 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .arch import RADIUS, STRIDES, Arch
+from .arch import FACTORS, RADIUS, STRIDES, Arch
 from .layers import conv_block, conv_pair, enlarge
 from .volume import first_volume, residual_volume, soft_argmin
-
-FACTORS = (8, 4, 2)
-"""Features of both embeddings at stages 1, 2, 3, in multiples of c."""
 
 
 class Stage(NamedTuple):
