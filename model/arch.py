@@ -11,6 +11,14 @@ from .files import first_fault
 
 Family = Literal["rts2net", "anynet"]
 Branches = Literal["disparity", "disparity+semantic", "full"]
+Precision = Literal["fp32", "fp16", "int8"]
+
+UNTRAINED = "untrained"
+"""The origin of random weights."""
+
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+"""ImageNet's, for RGB in 0 … 1: what every network expects its images normalised with."""
 
 STRIDES = (16, 8, 4)
 """The resolution of stages 1, 2, 3 as a divisor of the image's (paper, section III-C)."""
@@ -23,6 +31,11 @@ RADIUS = 2
 
 CONV3D = (16, 4, 4)
 """The paper's 3D convolution widths for stages 1, 2, 3."""
+
+SPACE_C = tuple(range(1, 33))
+SPACE_D_MAX = tuple(range(6, 25))
+SPACE_CONV3D = ((4, 8, 12, 16, 24, 32), (2, 4, 6, 8, 12, 16), (2, 4, 6, 8, 12, 16))
+"""What each dimension takes in the space that is searched and timed."""
 
 
 class Arch(BaseModel):

@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from .anynet import AnyNet
-from .arch import Arch
+from .arch import UNTRAINED, Arch
 from .errors import Rts2Error, UsageError
 from .files import existing_file, parse_json, replacing
 from .rts2net import RTS2Net
@@ -39,9 +39,6 @@ class Header(BaseModel):
     @property
     def trained(self) -> bool:
         return self.origin != UNTRAINED
-
-
-UNTRAINED = "untrained"
 
 
 def build(arch: Arch) -> Network:

@@ -8,12 +8,18 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from .errors import Rts2Error, UsageError
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 Command = Callable[[Sequence[str] | None], int]
 Item = TypeVar("Item")
+
+WIDTH = 120
+"""Columns of what is piped or redirected."""
 
 KITTI = (1242, 375)
 """Width and height of KITTI's images, the paper's resolution."""
@@ -83,6 +89,13 @@ def progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
     console = Console(stderr=True)
     disabled = not console.is_terminal
     return iter(track(items, title, total=total, console=console, disable=disabled))
+
+
+def screen() -> Console:
+    """Where tables go: stdout, wide enough for a table where it is no terminal."""
+    from rich.console import Console
+
+    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
 
 
 def positive(text: str) -> float:

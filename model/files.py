@@ -8,7 +8,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from shutil import rmtree
+from tempfile import NamedTemporaryFile, mkdtemp
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -62,6 +63,33 @@ def output_folder(path: Path) -> Path:
             return path
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+@contextmanager
+def replacing_folder(path: Path, marker: str) -> Iterator[Path]:
+    """Yields an empty folder beside `path`; it becomes `path` only if the block succeeds.
+
+    What stands at `path` is replaced if it is empty or holds a file named `marker`, which tells
+    an earlier result; anything else is the user's and stays.
+    """
+    occupied = path.is_dir() and any(path.iterdir()) and not (path / marker).is_file()
+    if occupied or (path.exists() and not path.is_dir()):
+        raise Rts2Error(f"cannot write {path}: something else stands there; choose another --out")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    try:
+        yield temporary
+        temporary.chmod(0o777 & ~_umask())
+        if path.exists():
+            rmtree(path)
+        temporary.replace(path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    finally:
+        rmtree(temporary, ignore_errors=True)
 
 
 def existing_file(path: Path, what: str) -> Path:

@@ -7,7 +7,7 @@ because a search tabulates each part over the few dimensions that it depends on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
@@ -98,7 +98,7 @@ def encoder(c: int, branches: Branches, size: Size) -> Iterator[Op]:
     yield Op("encoder.pair", "concat", (image, image), (2, 3, height, width))
     yield from _conv_block("encoder.stem.0", (2, 3, height, width), c)
     yield from _conv_block("encoder.stem.1", (2, c, height, width), c, stride=2)
-    below = (2, c, height // 2, width // 2)
+    below: Shape = (2, c, height // 2, width // 2)
     for name, factor in (("quarter", 2), ("eighth", 4), ("sixteenth", 8)):
         below = yield from _down(f"encoder.{name}", below, factor * c)
     if branches != "disparity":
@@ -238,7 +238,7 @@ def _conv_block(name: str, inputs: Shape, outputs: int, stride: int = 1) -> Iter
     yield Op(f"{name}.relu", "relu", (output,), output)
 
 
-def _down(name: str, below: Shape, outputs: int) -> Iterator[Op]:
+def _down(name: str, below: Shape, outputs: int) -> Generator[Op, None, Shape]:
     """Half the size and a pair of conv blocks; returns the shape that comes out."""
     pooled = (*below[:2], below[2] // 2, below[3] // 2)
     yield Op(f"{name}.pool", "pool", (below,), pooled)
