@@ -1,0 +1,132 @@
+"""From timings to coefficients: non-negative least squares on relative error, and its honest check.
+
+Few coefficients against few points, so a fit is judged by leaving each point out in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, nnls
+
+from ..model.errors import Rts2Error
+from ..model.ops import ops
+from .latency import Floats, LatencyModel, Steps, latencies_ms
+from .profile import Calibration, Point, Profile
+
+
+def fit(points: Sequence[Point], form: LatencyModel) -> LatencyModel:
+    """`form` with coefficients that fit `points`; its own values do not matter.
+
+    The sum form is linear and starts the search; the max form is refined from there.
+
+    Raises:
+        Rts2Error: fewer points than coefficients.
+    """
+    steps, truth = _table(points)
+    return _fit(steps, truth, form)
+
+
+def recalibrated(profile: Profile) -> Profile:
+    """`profile` with every calibration fitted again to the profile's own points."""
+    return profile.model_copy(
+        update={
+            "calibrations": tuple(
+                calibrated(profile, known.model, known) for known in profile.calibrations
+            )
+        }
+    )
+
+
+def calibrated(profile: Profile, form: LatencyModel, known: Calibration) -> Calibration:
+    """`known` with `form` fitted to its points in `profile`, and the residuals that go with it."""
+    points = profile.points_of(known.runtime, known.precision)
+    residuals = tuple(float(residual) for residual in leave_one_out(points, form))
+    return known.model_copy(update={"model": fit(points, form), "residuals": residuals})
+
+
+def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
+    """ln(true / predicted) of each point, predicted by a fit on all the others."""
+    residuals = []
+    for index, point in enumerate(points):
+        others = [*points[:index], *points[index + 1 :]]
+        predicted = latencies_ms(fit(others, form), Steps.of([ops(point.arch, point.resolution)]))
+        residuals.append(np.log(point.latency_ms / predicted[0]))
+    return np.array(residuals)
+
+
+def _table(points: Sequence[Point]) -> tuple[Steps, Floats]:
+    steps = Steps.of([ops(point.arch, point.resolution) for point in points])
+    return steps, np.array([point.latency_ms for point in points])
+
+
+def _fit(steps: Steps, truth: Floats, form: LatencyModel) -> LatencyModel:
+    if len(truth) <= len(form.ms_per):
+        raise Rts2Error(
+            f"{len(form.ms_per) + 1} coefficients need at least as many timings, not {len(truth)}"
+        )
+    columns = np.stack([latencies_ms(unit, steps) for unit in _units(form)], 1)
+    scale = (columns / truth[:, None]).max(0)
+    scale[scale == 0] = 1.0
+    start, _ = nnls(columns / truth[:, None] / scale, np.ones(len(truth)))
+
+    def misses(values: NDArray[np.float64]) -> Floats:
+        predicted = latencies_ms(_with(form, values / scale), steps)
+        return np.asarray(np.log(predicted / truth))
+
+    bounded = np.maximum(start, 1e-3)
+    found = least_squares(misses, bounded, bounds=(0, np.inf), xtol=1e-12, ftol=1e-12)
+    return _with(form, found.x / scale)
+
+
+def _with(form: LatencyModel, values: NDArray[np.float64]) -> LatencyModel:
+    start, *rest = (float(value) for value in values)
+    per = dict(zip(form.ms_per, rest, strict=True))
+    return form.model_copy(update={"start_ms": start, "ms_per": per})
+
+
+def _units(form: LatencyModel) -> list[LatencyModel]:
+    """One model per coefficient, that coefficient 1 and the others 0, costs added up."""
+    rows = np.eye(1 + len(form.ms_per))
+    return [_with(form, row).model_copy(update={"combine": "sum"}) for row in rows]
+
+
+def summary(residuals: Sequence[float]) -> dict[str, float]:
+    """Mean and worst absolute relative error, and the shares within 5% and 10%, as fractions."""
+    errors = np.abs(np.exp(-np.asarray(residuals)) - 1)
+    return {
+        "mape": float(errors.mean()),
+        "max_ape": float(errors.max()),
+        "within_5": float((errors <= 0.05).mean()),
+        "within_10": float((errors <= 0.10).mean()),
+    }
+
+
+FORMS: dict[str, LatencyModel] = {
+    # Eager PyTorch behind a slow processor: each kernel's launch adds to its work.
+    "eager": LatencyModel(
+        combine="sum",
+        starts="kernels",
+        start_ms=0,
+        ms_per=dict.fromkeys(("gmac_2d", "gmac_2d_single", "gbyte", "mvoxel_warp"), 0.0),
+    ),
+    # A GPU that waits for launches: a step takes its launch or its work, whichever is longer.
+    "launch_bound": LatencyModel(
+        combine="max",
+        starts="steps",
+        folded=("norm", "relu"),
+        start_ms=0,
+        ms_per=dict.fromkeys(("gmac_2d", "gmac_3d"), 0.0),
+    ),
+    # A fused graph on a CPU: norm and ReLU live inside the convs, channels come in blocks.
+    "fused_cpu": LatencyModel(
+        combine="sum",
+        starts="steps",
+        folded=("norm", "relu"),
+        start_ms=0,
+        ms_per=dict.fromkeys(("gmac_2d_blocked", "gmac_3d", "gbyte", "mvoxel_warp"), 0.0),
+    ),
+}
+"""The shapes that a fit fills with coefficients."""

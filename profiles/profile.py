@@ -1,0 +1,208 @@
+"""A device in one JSON file: what it can do, how fast, and where each number comes from."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from ..model.arch import Arch, Precision
+from ..model.errors import UsageError
+from ..model.files import parse_json, read_json
+from ..model.ops import Kind
+from .latency import FEATURES, LatencyModel
+
+Runtime = Literal["pytorch", "onnxruntime", "openvino", "tensorrt"]
+Side = Annotated[int, Field(ge=32, le=16384)]
+Resolution = tuple[Side, Side]
+Factor = Annotated[float, Field(gt=0, le=100)]
+
+START = "start"
+"""The key of the cost of starting a step among a derivation's factors."""
+
+
+class Frozen(BaseModel):
+    """A value of a profile: unknown fields are refused, known ones never change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class Fact(Frozen):
+    """One property of the hardware or its software, with its source."""
+
+    name: str
+    value: str
+    source: str
+
+
+class PrecisionSupport(Frozen):
+    """Whether a precision is worth running on the device; a refusal says why and what instead."""
+
+    precision: Precision
+    supported: bool
+    reason: str
+    source: str
+
+
+class RuntimeSupport(Frozen):
+    """A runtime of the device and its limits."""
+
+    runtime: Runtime
+    version: str
+    opset: Annotated[int, Field(ge=9, le=30)] | None = None
+    """The highest ONNX opset that it reads."""
+    operators: str | None = None
+    """The name of the table of operators that it reads, among `opsets/`."""
+    source: str
+
+
+class Point(Frozen):
+    """One timing of one network, batch 1, the network alone."""
+
+    arch: Arch
+    runtime: Runtime
+    precision: Precision
+    resolution: Resolution
+    fps: Annotated[float, Field(gt=0, lt=1e6)]
+    evidence: Literal["published", "measured"]
+    source: str
+
+    @property
+    def latency_ms(self) -> float:
+        return 1000 / self.fps
+
+
+class Calibration(Frozen):
+    """A latency model fitted to the profile's points of one runtime and precision."""
+
+    runtime: Runtime
+    precision: Precision
+    model: LatencyModel
+    residuals: tuple[float, ...]
+    """Leave-one-out ln(true / predicted), in the order of the points."""
+    source: str
+
+
+class Derivation(Frozen):
+    """A latency model that nobody calibrated: another one's, scaled by hardware ratios.
+
+    `factors` multiplies coefficients by name (`start` is the cost of starting a step).
+    """
+
+    runtime: Runtime
+    precision: Precision
+    base: tuple[Runtime, Precision]
+    factors: dict[str, Factor]
+    folded: tuple[Kind, ...] = ()
+    source: str
+
+    @field_validator("factors")
+    @classmethod
+    def _known(cls, value: dict[str, float]) -> dict[str, float]:
+        unknown = sorted(value.keys() - FEATURES.keys() - {START})
+        if unknown:
+            raise ValueError(
+                f"{unknown[0]} is no coefficient; known are {START}, {', '.join(FEATURES)}"
+            )
+        return value
+
+    def scale(self, model: LatencyModel) -> LatencyModel:
+        """`model` with this derivation's factors applied."""
+        return LatencyModel.model_validate(
+            {
+                **model.model_dump(),
+                "start_ms": model.start_ms * self.factors.get(START, 1.0),
+                "ms_per": {n: ms * self.factors.get(n, 1.0) for n, ms in model.ms_per.items()},
+                "folded": sorted({*model.folded, *self.folded}),
+            }
+        )
+
+
+class Machine(Frozen):
+    """Where and when a profile's measurements were taken."""
+
+    processor: str
+    threads: Annotated[int, Field(ge=1)]
+    system: str
+    versions: dict[str, str]
+    date: str
+
+
+class Profile(Frozen):
+    """Everything that rts2 knows of one device."""
+
+    schema_: Literal["rts2.profile/1"] = Field(alias="schema")
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
+    title: str
+    hardware: tuple[Fact, ...]
+    precisions: tuple[PrecisionSupport, ...]
+    runtimes: tuple[RuntimeSupport, ...]
+    calibrations: Annotated[tuple[Calibration, ...], Field(min_length=1)]
+    derivations: tuple[Derivation, ...] = ()
+    points: tuple[Point, ...]
+    machine: Machine | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Profile:
+        calibrated = {(known.runtime, known.precision) for known in self.calibrations}
+        for known in self.calibrations:
+            points = len(self.points_of(known.runtime, known.precision))
+            if len(known.residuals) != points:
+                raise ValueError(
+                    f"{known.runtime} {known.precision} has {points} points "
+                    f"and {len(known.residuals)} residuals"
+                )
+        for derived in self.derivations:
+            if derived.base not in calibrated:
+                raise ValueError(
+                    f"{derived.runtime} {derived.precision} derives from no calibration"
+                )
+        return self
+
+    def points_of(self, runtime: Runtime, precision: Precision) -> tuple[Point, ...]:
+        """The timings of one runtime and precision."""
+        return tuple(p for p in self.points if (p.runtime, p.precision) == (runtime, precision))
+
+    def calibration(self, runtime: Runtime, precision: Precision) -> Calibration:
+        """What was fitted for a runtime and precision; `UsageError` where nothing was."""
+        for known in self.calibrations:
+            if (known.runtime, known.precision) == (runtime, precision):
+                return known
+        known_ones = ", ".join(f"{c.precision} on {c.runtime}" for c in self.calibrations)
+        raise UsageError(
+            f"{self.title} is not calibrated for {precision} on {runtime}; it is for {known_ones}"
+        )
+
+    def refusal(self, precision: Precision) -> PrecisionSupport | None:
+        """Why the device does not run a precision; None where it does."""
+        for support in self.precisions:
+            if support.precision == precision:
+                return None if support.supported else support
+        return PrecisionSupport(
+            precision=precision, supported=False, reason="the profile does not list it", source=""
+        )
+
+
+def names() -> list[str]:
+    """The devices that rts2 ships a profile of."""
+    folder = resources.files(__package__) / "devices"
+    return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".json"))
+
+
+def load(device: str) -> Profile:
+    """A profile by its name, or from a JSON file.
+
+    Raises:
+        UsageError: neither a known name nor a file.
+        Rts2Error: the file is no profile; names the first wrong field.
+    """
+    if device in names():
+        text = (resources.files(__package__) / "devices" / f"{device}.json").read_text("utf-8")
+        return parse_json(text, Profile, f"the profile of {device}")
+    if device.endswith(".json") or "/" in device:
+        return read_json(Path(device), Profile, "a device profile")
+    raise UsageError(
+        f"unknown device {device!r}; known are {', '.join(names())}, or give a profile's JSON file"
+    )

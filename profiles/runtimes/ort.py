@@ -1,0 +1,33 @@
+"""ONNX Runtime on the CPU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+
+class Session:
+    """An ONNX file that is ready to run on inputs of its own, for timing."""
+
+    def __init__(self, path: Path, threads: int) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        self._session = onnxruntime.InferenceSession(
+            path, options, providers=["CPUExecutionProvider"]
+        )
+        noise = np.random.default_rng(0)
+        self._inputs = {
+            given.name: noise.standard_normal(given.shape, dtype=np.float32)
+            for given in self._session.get_inputs()
+        }
+
+    def run(self) -> None:
+        """One pair through the network."""
+        self._session.run(None, self._inputs)
+
+
+def versions() -> dict[str, str]:
+    """The runtime's version, as a profile records it."""
+    return {"onnxruntime": onnxruntime.__version__}
