@@ -1,0 +1,243 @@
+"""The commands that find a network and write what deploys it: rts2-search and rts2-deploy."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+from ..model.arch import UNTRAINED, Precision
+from ..model.console import (
+    KITTI,
+    add_output,
+    command,
+    parser,
+    positive,
+    print_json,
+    resolution,
+    screen,
+)
+from ..model.errors import NothingFeasible, UsageError
+from ..model.files import output_folder, replacing_folder, write_bytes, write_json
+from ..profiles.profile import Profile, Runtime, load, names
+from .accuracy import source
+from .deploy.bundle import next_step, runtime_of, write
+from .deploy.configuration import Deployment, of_arch, of_point
+from .exhaustive import Question
+from .exhaustive import search as search_all
+from .result import Found, Task, read
+
+if TYPE_CHECKING:
+    from ..model.checkpoint import Network
+
+
+@command
+def search(arguments: Sequence[str] | None = None) -> int:
+    """Finds the most accurate network that holds a frame rate on a device."""
+    options = _search_parser().parse_args(arguments)
+    profile = load(options.device)
+    out = output_folder(options.out)
+    found = search_all(_question(options, profile), source(options.accuracy))
+    written = _write(found, profile, out)
+    if options.json:
+        print_json(found.model_dump(mode="json", by_alias=True))
+    else:
+        from .report import show
+
+        show(found, profile, written, screen())
+    if found.selected is None:
+        raise NothingFeasible(_infeasible(found, profile))
+    return 0
+
+
+def _search_parser() -> argparse.ArgumentParser:
+    described = parser(
+        "rts2-search",
+        "Finds the most accurate RTS²Net that holds a frame rate on a device, and the whole "
+        "Pareto front of accuracy against frames per second beside it.",
+        "rts2-search --device tx2 --target-fps 10",
+    )
+    add = described.add_argument
+    add("--device", required=True, help=f"{', '.join(names())}, or a device profile's JSON file")
+    add("--target-fps", required=True, type=positive, metavar="F", help="frames per second to hold")
+    text = "image size, WxH (default: 1242x375, KITTI's)"
+    add("--resolution", type=resolution, default=KITTI, metavar="WxH", help=text)
+    text = "stereo admits networks without the semantic branch"
+    add("--task", choices=get_args(Task), default="semantic-stereo", help=text)
+    text = "what accuracy means (default: d1_all)"
+    add("--objective", choices=("d1_all", "epe", "miou"), default="d1_all", help=text)
+    text = "the paper's tables, or a JSON file of measured accuracies"
+    add("--accuracy", default="published", metavar="published|PATH", help=text)
+    text = "only this precision (may be repeated)"
+    add("--precision", action="append", choices=get_args(Precision), default=[], help=text)
+    text = "only this runtime (may be repeated)"
+    add("--runtime", action="append", choices=get_args(Runtime), default=[], help=text)
+    text = "meet the target at the lower bound of the interval of this confidence, such as 0.9"
+    add("--confidence", type=_probability, metavar="P", help=text)
+    add("--allow-extrapolated", action="store_true", help="let the pick rest on extrapolation")
+    add("--max-size-mb", type=positive, metavar="MB", help="upper bound of the weights, 10⁶ bytes")
+    add("--min-depth", type=positive, metavar="M", help="nearest distance to see, in metres")
+    add("--focal", type=positive, metavar="PX", help="focal length, in pixels")
+    add("--baseline", type=positive, metavar="M", help="distance of the cameras, in metres")
+    add_output(described)
+    return described
+
+
+def _probability(text: str) -> float:
+    value = positive(text)
+    if value >= 1:
+        raise argparse.ArgumentTypeError(f"must be above 0 and below 1, not {text!r}")
+    return value
+
+
+def _question(options: argparse.Namespace, profile: Profile) -> Question:
+    megabytes = options.max_size_mb
+    return Question(
+        profile=profile,
+        target_fps=options.target_fps,
+        resolution=options.resolution,
+        task=options.task,
+        objective=options.objective,
+        confidence=options.confidence or Question.confidence,
+        at_lower_bound=options.confidence is not None,
+        allow_extrapolated=options.allow_extrapolated,
+        precisions=tuple(options.precision),
+        runtimes=tuple(options.runtime),
+        max_size_bytes=float("inf") if megabytes is None else megabytes * 1e6,
+        min_disparity=_min_disparity(options),
+    )
+
+
+def _min_disparity(options: argparse.Namespace) -> float:
+    """The disparity of the nearest point to see: focal length times baseline over depth."""
+    geometry = (options.min_depth, options.focal, options.baseline)
+    if all(value is None for value in geometry):
+        return 0.0
+    if None in geometry:
+        raise UsageError("--min-depth, --focal and --baseline need one another; give all three")
+    depth, focal, baseline = geometry
+    return float(focal * baseline / depth)
+
+
+def _write(found: Found, profile: Profile, out: Path) -> list[str]:
+    from .plot import save
+    from .report import as_csv
+
+    write_json(out / "front.json", found.model_dump(mode="json", by_alias=True))
+    write_bytes(out / "front.csv", as_csv(found).encode())
+    save(found, profile.title, out / "front.png")
+    written = [f"{out}/", "front.json", "front.csv", "front.png"]
+    if found.selected is None:
+        (out / "deployment.json").unlink(missing_ok=True)
+        return written
+    configuration = of_point(found.selected, found, profile)
+    write_json(out / "deployment.json", configuration.model_dump(mode="json", by_alias=True))
+    return [*written, "deployment.json"]
+
+
+@command
+def deploy(arguments: Sequence[str] | None = None) -> int:
+    """Writes the folder that runs a network on a device."""
+    options = _deploy_parser().parse_args(arguments)
+    profile = load(options.device)
+    asked = _asked(options, profile)
+    network, origin = _weights(options, asked)
+    if asked is None:
+        size = options.resolution or KITTI
+        asked = of_arch(network.arch, profile, "fp32", runtime_of(profile).runtime, size)
+    with replacing_folder(options.out, "deployment.json") as folder:
+        complete = write(network, asked, profile, origin, folder)
+    if options.json:
+        print_json(complete.model_dump(mode="json", by_alias=True))
+        return 0
+    screen().print(
+        f"{complete.arch.label()} for {profile.title}, {complete.precision}, weights {origin}"
+    )
+    names = "  ".join([file.name for file in complete.files] + ["deployment.json"])
+    screen().print(f"written   {options.out}/  {names}", soft_wrap=True)
+    screen().print(f"next      on the device: {next_step(profile)}")
+    return 0
+
+
+def _deploy_parser() -> argparse.ArgumentParser:
+    described = parser(
+        "rts2-deploy",
+        "Writes the folder that runs a network on a device: the ONNX graph, its configuration, "
+        "how to build it there and how to check it there.",
+        "rts2-deploy --front rts2-out/front.json --device tx2 --model trained.safetensors",
+    )
+    add = described.add_argument
+    add("--device", required=True, help=f"{', '.join(names())}, or a device profile's JSON file")
+    text = "a search's result: its pick is deployed"
+    add("--front", type=Path, metavar="front.json", help=text)
+    text = "deploy the front's prospect instead of its pick"
+    add("--prospect", action="store_true", help=text)
+    text = "a checkpoint; with --front it must hold the pick's arch, and is cut to it"
+    add("--model", type=Path, metavar="CHECKPOINT", help=text)
+    text = "random weights, to try speed and integration without a trained network"
+    add("--untrained", action="store_true", help=text)
+    add("--seed", type=int, default=0, help="of the random weights (default: 0)")
+    text = "image size, WxH (default: the search's, else 1242x375)"
+    add("--resolution", type=resolution, metavar="WxH", help=text)
+    add_output(described, out="rts2-bundle")
+    return described
+
+
+def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
+    """The configuration that the front asks for; None without a front."""
+    if options.front is None:
+        if options.model is None:
+            raise UsageError("give --front front.json, --model CHECKPOINT, or both")
+        return None
+    found = read(options.front)
+    if found.device != profile.name:
+        raise UsageError(
+            f"{options.front} was searched for {found.device}, not for {profile.name}; "
+            "search again for that device"
+        )
+    if options.resolution not in (None, found.resolution):
+        width, height = found.resolution
+        raise UsageError(f"{options.front} was searched at {width}x{height}; search again")
+    point = found.prospect if options.prospect else found.selected
+    if point is None:
+        role = "prospect" if options.prospect else "pick"
+        raise NothingFeasible(f"{options.front} has no {role}; search with another target")
+    return of_point(point, found, profile)
+
+
+def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Network, str]:
+    """The network to deploy and where its weights come from."""
+    from ..model.checkpoint import build, cut
+    from ..model.checkpoint import load as load_checkpoint
+
+    if options.model is not None:
+        network, header = load_checkpoint(options.model)
+        if not header.trained and not options.untrained:
+            raise UsageError(f"{options.model} is untrained; --untrained deploys it all the same")
+        return (cut(network, asked.arch) if asked else network), header.origin
+    if not options.untrained:
+        raise UsageError(
+            "a bundle needs weights: give --model CHECKPOINT, or say --untrained for random ones"
+        )
+    import torch
+
+    assert asked is not None, "without a model there is a front"
+    torch.manual_seed(options.seed)
+    return build(asked.arch), UNTRAINED
+
+
+def _infeasible(found: Found, profile: Profile) -> str:
+    """Why there is no pick, in one line, and what to do."""
+    asked = f"no candidate holds {found.target_fps:g} FPS on {profile.title}"
+    asked += " on evidence better than extrapolation"
+    if found.prospect is not None:
+        point = found.prospect
+        return (
+            f"{asked}; {point.fps:.1f} FPS is extrapolated for {point.arch.label()} "
+            "(--allow-extrapolated takes it)"
+        )
+    if found.nearest is None:
+        return f"{asked}; every candidate was left out, see left_out"
+    point = found.nearest
+    return f"{asked}; the fastest has {point.fps:.1f} FPS: {point.arch.label()}"

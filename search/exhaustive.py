@@ -1,0 +1,412 @@
+"""The search itself: every candidate of the space, none sampled.
+
+One block of the space (a runtime, a precision, a stage count) is laid out at a time: its
+latencies by broadcasting, its accuracies from the source, then what cannot be chosen is left out
+and counted, and only the rest is carried on to the front.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import exp
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.arch import CONV3D, STRIDES, Arch, Precision
+from ..model.errors import UsageError
+from ..model.ops import Size, padded
+from ..profiles.conformal import half_width
+from ..profiles.evidence import Evidence, boxes
+from ..profiles.latency import Floats, LatencyModel, latencies_ms
+from ..profiles.profile import Calibration, Profile, Resolution, Runtime
+from ..profiles.profile import Point as Timing
+from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric
+from .front import fastest, nondominated, pick
+from .result import Coverage, Found, LeftOut, Point, PointEvidence, Task
+from .space import Parts, Space
+
+Flags = NDArray[np.bool_]
+
+BYTES_PER_WEIGHT: dict[Precision, int] = {"fp32": 4, "fp16": 2, "int8": 1}
+
+KEEPS_ACCURACY: tuple[Precision, ...] = ("fp32", "fp16")
+"""Half precision rounds to 11 bits, far below the tables' last digit; integers do not."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the user wants to know."""
+
+    profile: Profile
+    target_fps: float
+    resolution: Resolution = (1242, 375)
+    task: Task = "semantic-stereo"
+    objective: Metric = "d1_all"
+    confidence: float = 0.9
+    at_lower_bound: bool = False
+    """Whether the interval's lower end must meet the target."""
+    allow_extrapolated: bool = False
+    precisions: tuple[Precision, ...] = ()
+    """Only these; all that the device has when empty."""
+    runtimes: tuple[Runtime, ...] = ()
+    max_size_bytes: float = float("inf")
+    min_disparity: float = 0.0
+    """The widest disparity that must fit into the first volume, in pixels."""
+
+
+@dataclass(frozen=True)
+class Executor:
+    """One runtime and precision of the device, and the latency model that predicts it."""
+
+    runtime: Runtime
+    precision: Precision
+    model: LatencyModel
+    base: Calibration
+    """What was calibrated: this very executor, or the one that it derives from."""
+
+    @property
+    def derived(self) -> bool:
+        return (self.runtime, self.precision) != (self.base.runtime, self.base.precision)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Candidates that may enter the front, one entry each."""
+
+    executor: NDArray[np.int64]
+    stages: NDArray[np.int64]
+    position: NDArray[np.int64]
+    """In the block of their stage count, flattened."""
+    latency_ms: Floats
+    half_width: Floats
+    """Of the interval, in natural logarithm."""
+    metrics: Floats
+    """(n, metrics)"""
+    evidence: NDArray[np.int64]
+    """(n, 2): latency's and accuracy's, as positions in `EVIDENCE`."""
+
+
+EVIDENCE: tuple[Evidence, ...] = ("published", "measured", "interpolated", "extrapolated")
+EXTRAPOLATED = EVIDENCE.index("extrapolated")
+
+
+def search(question: Question, source: AccuracySource, space: Space | None = None) -> Found:
+    """Every candidate of `space`, the front, the pick and the prospect.
+
+    Raises:
+        UsageError: a precision or runtime that the device refuses or lacks, or a confidence that
+            its calibration points cannot give.
+    """
+    started = time.perf_counter()
+    space = space or Space()
+    executors = _executors(question)
+    totals = _Totals(space)
+    found: list[_Columns] = []
+    left_out = Counter[str]()
+    for stages in space.stages:
+        accuracy = source.columns(space, stages)
+        for index, executor in enumerate(executors):
+            block = _Block(space, question, executor, accuracy, totals, stages)
+            left_out.update(block.leave_out())
+            found.append(block.columns(index, source.exact_evidence))
+    front = _front(question, totals, executors, found)
+    size = space.size() * len(executors)
+    return Found(
+        device=question.profile.name,
+        target_fps=question.target_fps,
+        resolution=question.resolution,
+        task=question.task,
+        objective=question.objective,
+        confidence=question.confidence,
+        space=Coverage(size=size, evaluated=size, exhaustive=True),
+        front=tuple(front),
+        **_choices(question, front),
+        left_out=tuple(LeftOut(reason=r, count=n) for r, n in left_out.most_common()),
+        elapsed_s=time.perf_counter() - started,
+    )
+
+
+class _Choices(TypedDict):
+    selected: Point | None
+    prospect: Point | None
+    nearest: Point | None
+
+
+def _choices(question: Question, front: list[Point]) -> _Choices:
+    """The pick on proven numbers, what extrapolated latency could win, the fastest otherwise."""
+    every = question.allow_extrapolated
+    proven = [point for point in front if every or point.proven]
+    timed = [point for point in front if every or point.evidence.accuracy != "extrapolated"]
+    selected, prospect = (
+        pick(points, question.target_fps, question.objective, question.at_lower_bound)
+        for points in (proven, timed)
+    )
+    return {
+        "selected": selected,
+        "prospect": prospect,
+        "nearest": None if selected else fastest(front),
+    }
+
+
+def _executors(question: Question) -> list[Executor]:
+    """The device's runtimes and precisions that the question admits."""
+    profile = question.profile
+    for precision in question.precisions:
+        if refusal := profile.refusal(precision):
+            raise UsageError(f"{profile.title} does not run {precision}: {refusal.reason}")
+    every = [Executor(c.runtime, c.precision, c.model, c) for c in profile.calibrations]
+    for derivation in profile.derivations:
+        base = profile.calibration(*derivation.base)
+        model = derivation.scale(base.model)
+        every.append(Executor(derivation.runtime, derivation.precision, model, base))
+    chosen = [
+        executor
+        for executor in every
+        if (not question.precisions or executor.precision in question.precisions)
+        and (not question.runtimes or executor.runtime in question.runtimes)
+        and profile.refusal(executor.precision) is None
+    ]
+    if not chosen:
+        known = ", ".join(f"{e.precision} on {e.runtime}" for e in every)
+        raise UsageError(f"{profile.title} has no latency for that choice; it has {known}")
+    return chosen
+
+
+class _Totals:
+    """Additive quantities of blocks; each input size is tabulated once."""
+
+    def __init__(self, space: Space) -> None:
+        self.space = space
+        self._parts: dict[Size, Parts] = {}
+
+    def latency_ms(self, model: LatencyModel, resolution: Resolution, stages: int) -> Floats:
+        """The predicted latency of every arch of a block."""
+        parts = self._at(resolution)
+        return parts.totals(stages, latencies_ms(model, parts.steps))
+
+    def weights(self, resolution: Resolution, stages: int) -> Floats:
+        """The trained numbers of every arch of a block."""
+        parts = self._at(resolution)
+        return parts.totals(stages, parts.steps.summed(parts.steps.weights))
+
+    def macs(self, resolution: Resolution, stages: int) -> Floats:
+        """The multiply-adds of every arch of a block."""
+        parts = self._at(resolution)
+        return parts.totals(stages, parts.steps.summed(parts.steps.macs))
+
+    def _at(self, resolution: Resolution) -> Parts:
+        size = padded(resolution, Arch().multiple)
+        if size not in self._parts:
+            self._parts[size] = Parts.of(self.space, resolution)
+        return self._parts[size]
+
+
+class _Block:
+    """One executor and stage count: its candidates, and which of them are left out."""
+
+    def __init__(
+        self,
+        space: Space,
+        question: Question,
+        executor: Executor,
+        accuracy: Accuracy,
+        totals: _Totals,
+        stages: int,
+    ) -> None:
+        self.space, self.question, self.executor = space, question, executor
+        self.accuracy, self.totals, self.stages = accuracy, totals, stages
+        self.shape = space.shape(stages)
+        self.latency_ms = totals.latency_ms(executor.model, question.resolution, stages)
+        self._free = np.ones(self.shape, dtype=bool)
+
+    def leave_out(self) -> dict[str, int]:
+        """Removes what cannot be chosen; counts it by reason, each candidate once."""
+        counts: Counter[str] = Counter()
+        for reason, excluded in self._exclusions():
+            removed = self._free & excluded
+            counts[reason] += int(np.count_nonzero(removed))
+            self._free &= ~removed
+        return {reason: count for reason, count in counts.items() if count}
+
+    def _exclusions(self) -> Iterator[tuple[str, Flags]]:
+        question, space, stages = self.question, self.space, self.stages
+        if question.task == "semantic-stereo":
+            without = space.along(stages, 0) == 0
+            yield "they have no semantic branch (--task stereo admits them)", without
+        if question.min_disparity:
+            blind = STRIDES[0] * space.along(stages, 2) < question.min_disparity
+            yield f"their d_max cannot see {question.min_disparity:.0f} px of disparity", blind
+        if question.max_size_bytes < float("inf"):
+            weights = self.totals.weights(question.resolution, stages)
+            size = BYTES_PER_WEIGHT[self.executor.precision] * weights
+            yield "their weights exceed --max-size-mb", size > question.max_size_bytes
+        yield from self._unknown()
+
+    def _unknown(self) -> Iterator[tuple[str, Flags]]:
+        """Candidates whose accuracy nobody knows, with what is missing."""
+        name = self.question.objective
+        precision = self.executor.precision
+        if precision not in KEEPS_ACCURACY:
+            yield f"no {name} is known in {precision}", np.array(True)
+        unknown = np.isnan(self.accuracy.metrics[name])
+        for stage in range(self.stages):
+            unusual = self.space.along(self.stages, 3 + stage) != CONV3D[stage]
+            reason = f"no {name} is known for their 3D widths (--accuracy FILE brings it)"
+            yield reason, unknown & unusual
+        yield f"no {name} is known for their stages and branches", unknown
+
+    def columns(self, executor: int, exact: Evidence) -> _Columns:
+        """What is left, flattened. `exact` is what a row of the accuracy source counts as."""
+        at = np.flatnonzero(self._free)
+        latency, timing = self._latency()
+        latency, timing = latency.reshape(-1)[at], timing.reshape(-1)[at]
+        metrics = [self.accuracy.metrics[metric].reshape(-1)[at] for metric in METRICS]
+        evidence = np.stack([timing, self._accuracy_evidence(exact).reshape(-1)[at]], 1)
+        return _Columns(
+            executor=np.full(len(at), executor),
+            stages=np.full(len(at), self.stages),
+            position=at,
+            latency_ms=latency,
+            half_width=self._half_width(at, timing == EXTRAPOLATED),
+            metrics=np.stack(metrics, 1),
+            evidence=evidence,
+        )
+
+    def _accuracy_evidence(self, exact: Evidence) -> NDArray[np.int64]:
+        between = EVIDENCE.index("interpolated")
+        # Rows were taken in single precision; what is carried over to another is not a row.
+        told = EVIDENCE.index(exact) if self.executor.precision == "fp32" else between
+        known = np.where(self.accuracy.exact, told, between)
+        return np.where(self.accuracy.extrapolated, EXTRAPOLATED, known)
+
+    def _latency(self) -> tuple[Floats, NDArray[np.int64]]:
+        """Latencies, timings put in where there are any, and the evidence of each."""
+        box = boxes(timing.arch for timing in self._timings()).get(self.stages)
+        if self.executor.derived or box is None or not self._resolution_known():
+            return self.latency_ms, np.full(self.shape, EXTRAPOLATED)
+        latency = self.latency_ms.copy()
+        inside = self.space.inside(self.stages, box)
+        evidence = np.where(inside, EVIDENCE.index("interpolated"), EXTRAPOLATED)
+        for timing in self._timings():
+            position = self.space.position(timing.arch)
+            same = _size(timing.resolution) == _size(self.question.resolution)
+            if position is not None and timing.arch.stages == self.stages and same:
+                latency[position] = timing.latency_ms
+                evidence[position] = EVIDENCE.index(timing.evidence)
+        return latency, evidence
+
+    def _half_width(self, at: NDArray[np.int64], extrapolated: Flags) -> Floats:
+        """The interval's half width in natural logarithm, for the positions `at`.
+
+        Where the model extrapolates, half of the log distance to the nearest calibrated network
+        is in doubt on top: a promised speed-up of two could be 1.4 or 2.8.
+        """
+        sure = half_width(self.executor.base.residuals, self.question.confidence)
+        if not extrapolated.any():
+            return np.full(len(at), sure)
+        speed_up = np.log(self.latency_ms.reshape(-1)[at] / self._anchor_ms(at))
+        return np.where(extrapolated, sure + 0.5 * np.abs(speed_up), sure)
+
+    def _anchor_ms(self, at: NDArray[np.int64]) -> Floats:
+        """For the archs at `at`, the latency of the nearest arch that the calibration spans.
+
+        Widths of stages that only the calibrated block has are moved into its box.
+        """
+        known = boxes(timing.arch for timing in self._timings())
+        stages = min(known, key=lambda count: (abs(count - self.stages), -count))
+        resolution = min(
+            {timing.resolution for timing in self._timings()},
+            key=lambda size: abs(np.log(_pixels(size) / _pixels(self.question.resolution))),
+        )
+        whole = self.totals.latency_ms(self.executor.base.model, resolution, stages)
+        own = np.unravel_index(at, self.shape)
+        nearest = self.space.nearest(stages, known[stages])
+        absent = (np.zeros_like(at),) * max(len(nearest) - len(own), 0)
+        moved = zip(nearest, (*own, *absent), strict=False)
+        anchors: Floats = whole[tuple(positions[index] for positions, index in moved)]
+        return anchors
+
+    def _timings(self) -> tuple[Timing, ...]:
+        base = self.executor.base
+        return self.question.profile.points_of(base.runtime, base.precision)
+
+    def _resolution_known(self) -> bool:
+        sizes = [_pixels(timing.resolution) for timing in self._timings()]
+        return min(sizes) <= _pixels(self.question.resolution) <= max(sizes)
+
+
+def _size(resolution: Resolution) -> Size:
+    """The input size: resolutions that are padded to the same one are the same work."""
+    return padded(resolution, Arch().multiple)
+
+
+def _pixels(resolution: Resolution) -> int:
+    height, width = _size(resolution)
+    return height * width
+
+
+def _front(
+    question: Question, totals: _Totals, executors: list[Executor], found: list[_Columns]
+) -> list[Point]:
+    """The points that no other beats: not in speed, not in accuracy, and not in evidence.
+
+    Evidence is an objective of its own, so that a promise never hides a measurement.
+    """
+    latency, metrics, evidence = (
+        np.concatenate([getattr(columns, name) for columns in found])
+        for name in ("latency_ms", "metrics", "evidence")
+    )
+    direction = 1 if LOWER_IS_BETTER[question.objective] else -1
+    accuracy = direction * metrics[:, METRICS.index(question.objective)]
+    kept = nondominated(np.column_stack([latency, accuracy, evidence == EXTRAPOLATED]))
+    points: list[Point] = []
+    start = 0
+    for columns in found:
+        stop = start + len(columns.position)
+        own = np.flatnonzero(kept[start:stop])
+        points += _points(question, totals, executors, columns, own)
+        start = stop
+    return sorted(points, key=lambda point: -point.fps)
+
+
+def _points(
+    question: Question,
+    totals: _Totals,
+    executors: list[Executor],
+    columns: _Columns,
+    own: NDArray[np.int64],
+) -> Iterator[Point]:
+    """The candidates `own` of one block as values."""
+    if not len(own):
+        return
+    stages, space = int(columns.stages[0]), totals.space
+    executor = executors[columns.executor[0]]
+    weights, macs = (
+        quantity(question.resolution, stages).reshape(-1)
+        for quantity in (totals.weights, totals.macs)
+    )
+    for at in own:
+        flat = columns.position[at]
+        position = np.unravel_index(flat, space.shape(stages))
+        latency, half = float(columns.latency_ms[at]), float(columns.half_width[at])
+        told = [EVIDENCE[code] for code in columns.evidence[at]]
+        known = zip(METRICS, columns.metrics[at], strict=True)
+        yield Point(
+            arch=space.arch(stages, tuple(int(index) for index in position)),
+            precision=executor.precision,
+            runtime=executor.runtime,
+            latency_ms=latency,
+            fps=1000 / latency,
+            fps_low=1000 / latency * exp(-half),
+            fps_high=1000 / latency * exp(half),
+            params=int(weights[flat]),
+            size_bytes=int(weights[flat]) * BYTES_PER_WEIGHT[executor.precision],
+            macs=int(macs[flat]),
+            evidence=PointEvidence(latency=told[0], accuracy=told[1]),
+            **{metric: None if np.isnan(value) else float(value) for metric, value in known},
+        )

@@ -1,0 +1,151 @@
+"""The front as a picture: accuracy against frames per second, the pick, the target, the doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..model.files import replacing
+from ..profiles.evidence import Evidence
+from .accuracy import LOWER_IS_BETTER
+from .report import AXIS, RUNTIMES, caption, headline
+from .result import Found, Point
+
+INK, PALE, ACCENT, PROMISE = "#1f2933", "#9aa5b1", "#c2410c", "#1d6fa5"
+MARKERS: dict[Evidence, str] = {
+    "published": "s",
+    "measured": "D",
+    "interpolated": "o",
+    "extrapolated": "^",
+}
+"""One marker for each evidence of the latency."""
+
+
+def save(found: Found, title: str, path: Path) -> None:
+    """Draws the front and writes it as PNG, whole or not at all."""
+    figure = draw(found, title)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def draw(found: Found, title: str) -> Figure:
+    """The picture of a front; `title` names the device."""
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    axes = figure.add_subplot()
+    proven = [point for point in found.front if point.proven]
+    promised = [point for point in found.front if not point.proven and _only_latency(point)]
+    for point, role, color in (
+        (found.selected, "pick", ACCENT),
+        (found.prospect if found.prospect != found.selected else None, "prospect", PROMISE),
+    ):
+        if point is not None:
+            _mark(axes, found, point, role, color)
+    _series(axes, found, proven, INK)
+    _series(axes, found, promised, PROMISE)
+    axes.axvline(found.target_fps, color=ACCENT, linestyle="--", linewidth=1)
+    axes.text(
+        found.target_fps,
+        1.0,
+        f" target {found.target_fps:g} FPS",
+        color=ACCENT,
+        fontsize=9,
+        va="bottom",
+        transform=axes.get_xaxis_transform(),
+    )
+    _frame(axes, found, title)
+    return figure
+
+
+def _only_latency(point: Point) -> bool:
+    return point.evidence.accuracy != "extrapolated"
+
+
+def _series(axes: Axes, found: Found, points: Sequence[Point], color: str) -> None:
+    """One line of points with their intervals, a marker for each evidence."""
+    drawn = [(point, y) for point in points if (y := point.metric(found.objective)) is not None]
+    if not drawn:
+        return
+    axes.plot([p.fps for p, _ in drawn], [y for _, y in drawn], color=color, alpha=0.25, zorder=1)
+    for evidence, marker in MARKERS.items():
+        group = [(point, y) for point, y in drawn if point.evidence.latency == evidence]
+        if not group:
+            continue
+        fps = [point.fps for point, _ in group]
+        spread = (
+            [point.fps - point.fps_low for point, _ in group],
+            [point.fps_high - point.fps for point, _ in group],
+        )
+        axes.errorbar(
+            fps,
+            [y for _, y in group],
+            xerr=spread,
+            fmt=marker,
+            color=color,
+            ecolor=color,
+            elinewidth=0.5,
+            alpha=0.85 if color == INK else 0.4,
+            markersize=4.5,
+            label=f"latency {evidence}",
+            zorder=2,
+        )
+
+
+def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None:
+    """A star, and in the legend what it stands for."""
+    value = point.metric(found.objective)
+    if value is None:
+        return
+    executor = f"{point.precision} on {RUNTIMES[point.runtime]}"
+    told = f"{point.fps:.1f} FPS, {caption(found.objective, value)}"
+    label = f"{role}: {point.arch.label()}\n{executor}, {told}"
+    axes.plot(
+        [point.fps],
+        [value],
+        "*",
+        label=label,
+        color=color,
+        markersize=17,
+        markeredgecolor="white",
+        zorder=4,
+    )
+
+
+def _frame(axes: Axes, found: Found, title: str) -> None:
+    width, height = found.resolution
+    better = "lower" if LOWER_IS_BETTER[found.objective] else "higher"
+    axes.set_title(headline(found, title), loc="left", fontsize=11, pad=18)
+    axes.set_xlabel(
+        f"frames per second at {width}×{height}, batch 1, network alone "
+        f"(bars: {found.confidence:.0%} interval)"
+    )
+    axes.set_ylabel(f"{AXIS[found.objective]}, {better} is better")
+    axes.set_xscale("log")
+    _plain_ticks(axes)
+    axes.grid(color=PALE, alpha=0.25, which="both", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    _legend(axes, found)
+
+
+def _legend(axes: Axes, found: Found) -> None:
+    """Where the front never is: slow and inaccurate."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
+    axes.legend(
+        fontsize=9,
+        loc="upper left" if LOWER_IS_BETTER[found.objective] else "lower left",
+        framealpha=0.9,
+        edgecolor="none",
+        labelspacing=0.7,
+    )
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Frame rates as a person writes them, a few in each decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
