@@ -22,9 +22,7 @@ def first_volume(left: Tensor, right: Tensor, planes: int) -> Tensor:
     width = left.shape[-1]
     padded = F.pad(right, (planes - 1, 0))
     starts = [planes - 1 - shift for shift in range(planes)]
-    return torch.stack(
-        [(left - padded[..., start : start + width]).abs().sum(1) for start in starts], 1
-    )
+    return torch.cat([_distance(left, padded[..., start : start + width]) for start in starts], 1)
 
 
 def residual_volume(left: Tensor, right: Tensor, disparity: Tensor) -> Tensor:
@@ -48,7 +46,7 @@ def residual_volume(left: Tensor, right: Tensor, disparity: Tensor) -> Tensor:
     warped = (
         columns[-k] + fraction * (columns[1 - k] - columns[-k]) for k in range(-RADIUS, RADIUS + 1)
     )
-    return torch.stack([(left - plane).abs().sum(1) for plane in warped], 1)
+    return torch.cat([_distance(left, plane) for plane in warped], 1)
 
 
 def soft_argmin(cost: Tensor, first: int) -> Tensor:
@@ -59,3 +57,8 @@ def soft_argmin(cost: Tensor, first: int) -> Tensor:
     planes = torch.arange(first, first + cost.shape[1], dtype=cost.dtype, device=cost.device)
     weights = torch.softmax(-cost, 1)
     return (weights * planes.view(1, -1, 1, 1)).sum(1, keepdim=True)
+
+
+def _distance(left: Tensor, right: Tensor) -> Tensor:
+    """The L1 distance over the channels: (B, C, H, W) twice → (B, 1, H, W)."""
+    return (left - right).abs().sum(1, keepdim=True)

@@ -1,0 +1,82 @@
+"""The ONNX files of rts2: what they say of themselves, reading and writing them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import onnx
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from pydantic import BaseModel, ConfigDict
+
+from .arch import Arch
+from .errors import Rts2Error
+from .files import existing_file, parse_json, write_bytes
+
+Precision = Literal["fp32", "fp16", "int8"]
+
+HEADER = "rts2"
+"""The key of our entry in the file's metadata."""
+
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+"""ImageNet's, for RGB in 0 … 1: what every network here expects its images normalised with."""
+
+
+class GraphHeader(BaseModel):
+    """What an ONNX file of ours says of itself."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    arch: Arch
+    """Cut to the stages that the graph runs."""
+    resolution: tuple[int, int]
+    """Width and height of the images it was made for."""
+    size: tuple[int, int]
+    """Width and height of its inputs: the resolution, padded."""
+    precision: Precision = "fp32"
+    mean: tuple[float, float, float] = MEAN
+    std: tuple[float, float, float] = STD
+    origin: str
+    """How the weights came to be, as the checkpoint has it."""
+    rts2: str
+    """The version of rts2 that wrote the file."""
+
+    @property
+    def stages(self) -> int:
+        return self.arch.stages
+
+
+def save_graph(model: onnx.ModelProto, header: GraphHeader, path: Path) -> None:
+    """Writes an ONNX model with our header, whole or not at all."""
+    onnx.helper.set_model_props(model, {HEADER: header.model_dump_json()})
+    write_bytes(path, model.SerializeToString(deterministic=True))
+
+
+def load_graph(path: Path) -> onnx.ModelProto:
+    """The ONNX model at `path`.
+
+    Raises:
+        UsageError: there is no such file.
+        Rts2Error: it is truncated or no ONNX file.
+    """
+    try:
+        return onnx.load_model_from_string(existing_file(path, "an ONNX file").read_bytes())
+    except (DecodeError, OSError) as error:
+        raise Rts2Error(f"{path} is truncated or no ONNX file: {error}") from error
+
+
+def read_header(path: Path) -> GraphHeader:
+    """What the ONNX file at `path` says of itself.
+
+    Raises as `load_graph` does, and `Rts2Error` for a file that rts2 did not write.
+    """
+    return header_of(load_graph(path), path)
+
+
+def header_of(model: onnx.ModelProto, path: Path) -> GraphHeader:
+    """Our header in the model that was read from `path`."""
+    entry = {entry.key: entry.value for entry in model.metadata_props}.get(HEADER)
+    if entry is None:
+        raise Rts2Error(f"{path} holds no arch; rts2 reads the ONNX files that rts2 writes")
+    return parse_json(entry, GraphHeader, f"the header of {path}")
