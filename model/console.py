@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -65,7 +66,7 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Command:
             print("interrupted", file=sys.stderr)
             return 130
         except BrokenPipeError:
-            sys.stderr.close()
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
 
     return guarded
@@ -95,7 +96,11 @@ def screen() -> Console:
     """Where tables go: stdout, wide enough for a table where it is no terminal."""
     from rich.console import Console
 
-    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+    class Screen(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # the reader has seen enough, which is no failure
+
+    return Screen(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
 
 
 def positive(text: str) -> float:

@@ -6,10 +6,11 @@ from itertools import product
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
+
 from rts2.model.arch import Arch, Family
 from rts2.model.checkpoint import build, parameters
 from rts2.model.ops import Op, ops, padded
-from torch.utils.flop_counter import FlopCounterMode
 
 VARIANTS = ((False, False), (True, False), (True, True))
 CORNERS = [

@@ -1,0 +1,75 @@
+"""What a person looks at: coloured disparity and painted semantics."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from .data.images import Bytes, Disparity
+
+BRIGHTEST: Final = 98
+"""The percentile of a disparity map that its colours end at, unless a maximum is given."""
+
+PALETTE: Bytes = np.array(
+    [
+        (128, 64, 128),  # road
+        (244, 35, 232),  # sidewalk
+        (70, 70, 70),  # building
+        (102, 102, 156),  # wall
+        (190, 153, 153),  # fence
+        (153, 153, 153),  # pole
+        (250, 170, 30),  # traffic light
+        (220, 220, 0),  # traffic sign
+        (107, 142, 35),  # vegetation
+        (152, 251, 152),  # terrain
+        (70, 130, 180),  # sky
+        (220, 20, 60),  # person
+        (255, 0, 0),  # rider
+        (0, 0, 142),  # car
+        (0, 0, 70),  # truck
+        (0, 60, 100),  # bus
+        (0, 80, 100),  # train
+        (0, 0, 230),  # motorcycle
+        (119, 11, 32),  # bicycle
+    ],
+    np.uint8,
+)
+"""Cityscapes' colours of train ids 0 … 18."""
+
+
+def coloured(disparity: Disparity, highest_px: float | None = None) -> Bytes:
+    """(H, W) in pixels → (H, W, 3) RGB: turbo from 0 (blue) to `highest_px` (red), unknown black.
+
+    Without `highest_px` the scale ends at the map's 98th percentile.
+    """
+    from matplotlib import colormaps
+
+    known = np.isfinite(disparity)
+    if highest_px is None:
+        highest_px = float(np.percentile(disparity[known], BRIGHTEST)) if known.any() else 1.0
+    share = np.where(known, disparity, 0) / max(highest_px, 1e-6)
+    colours = colormaps["turbo"](share.clip(0, 1), bytes=True)[..., :3]
+    painted: Bytes = np.where(known[..., None], colours, 0).astype(np.uint8)
+    return painted
+
+
+def painted(semantic: Bytes) -> Bytes:
+    """(H, W) train ids → (H, W, 3) RGB in Cityscapes' colours; other ids are black."""
+    return _full_palette()[semantic]
+
+
+def overlay(image: Bytes, semantic: Bytes, share: float = 0.5) -> Bytes:
+    """The image (H, W, 3) with its classes' colours laid over it; `share` of 1 hides the image."""
+    classes = painted(semantic).astype(np.float32)
+    mixed = np.where(
+        (semantic < len(PALETTE))[..., None], image * (1 - share) + classes * share, image
+    )
+    return np.rint(mixed).astype(np.uint8)
+
+
+def _full_palette() -> Bytes:
+    """A colour for every id that a byte can hold."""
+    colours = np.zeros((256, 3), np.uint8)
+    colours[: len(PALETTE)] = PALETTE
+    return colours

@@ -1,0 +1,476 @@
+"""rts2-infer and rts2-eval as a user meets them: results, exit codes, one line for each mistake."""
+
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+from PIL import Image
+
+from rts2.model.arch import Arch
+from rts2.model.checkpoint import build, save
+from rts2.model.cli import evaluate, infer
+from rts2.model.data.images import read_disparity, read_rgb, read_whole
+from rts2.model.predictor import Estimate, open_model
+
+Command = Callable[[list[str]], int]
+
+CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\nbaseline=500\nwidth=96\nheight=64\n"
+
+
+def put(path: Path, pixels: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def noise(seed: int, height: int = 64, width: int = 96) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return generator.integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints of two small networks with random weights."""
+    folder = tmp_path_factory.mktemp("models")
+    save(build(Arch(c=1, d_max=4)), folder / "full.safetensors", "a test")
+    save(build(Arch(family="anynet", c=1)), folder / "anynet.safetensors", "a test")
+    return folder
+
+
+@pytest.fixture
+def home(tmp_path: Path, models: Path) -> Path:
+    """Two folders of two pairs, and a KITTI of one frame."""
+    for side, seed in (("left", 0), ("right", 10)):
+        for index in range(2):
+            put(tmp_path / side / f"{index}.png", noise(seed + index))
+    training = tmp_path / "kitti" / "training"
+    put(training / "image_2" / "000000_10.png", noise(0))
+    put(training / "image_3" / "000000_10.png", noise(1))
+    put(training / "disp_occ_0" / "000000_10.png", np.full((64, 96), 2560, np.uint16))
+    labels = np.full((64, 96), 7, np.uint8)
+    put(training / "semantic" / "000000_10.png", labels)
+    return tmp_path
+
+
+def infer_arguments(home: Path, model: Path, *more: str) -> list[str]:
+    sides = [str(home / side / "0.png") for side in ("left", "right")]
+    return [*sides, "--model", str(model), "--out", str(home / "out"), *more]
+
+
+def evaluate_arguments(home: Path, model: Path, *more: str) -> list[str]:
+    return [str(model), "--dataset", "kitti2015", "--data", str(home / "kitti"), *more]
+
+
+def report(run: Command, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> Any:
+    """What the command prints with --json; it must succeed and say nothing else."""
+    assert run([*arguments, "--json"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    return json.loads(printed.out)
+
+
+def refusal(
+    run: Command, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str]:
+    """The exit code and the one line on stderr of a command that must fail."""
+    code = run(arguments)
+    printed = capsys.readouterr()
+    assert code != 0
+    assert printed.out == ""
+    assert len(printed.err.splitlines()) == 1, printed.err
+    assert "Traceback" not in printed.err
+    return code, printed.err
+
+
+def left_behind(home: Path) -> list[Path]:
+    out = home / "out"
+    return sorted(out.rglob("*")) if out.is_dir() else []
+
+
+def test_import_is_light() -> None:
+    heavy = "{'torch', 'onnx', 'onnxruntime', 'matplotlib', 'rich'}"
+    code = f"import sys, rts2.model.cli; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_pair_gives_every_file(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "calib.txt").write_text(CALIBRATION)
+    arguments = infer_arguments(
+        home, models / "full.safetensors", "--calib", str(home / "calib.txt")
+    )
+    told = report(infer, arguments, capsys)
+    assert told["schema"] == "rts2.infer/1"
+    assert told["arch"]["c"] == 1
+    assert told["origin"] == "a test"
+    (pair,) = told["pairs"]
+    kinds = ("cloud.ply", "color.png", "disparity.png", "overlay.png", "semantic.png")
+    assert sorted(pair["files"]) == [f"0_{kind}" for kind in kinds]
+    assert [path.name for path in left_behind(home)] == sorted(pair["files"])
+
+    left, right = (read_rgb(home / side / "0.png") for side in ("left", "right"))
+    expected = open_model(models / "full.safetensors").predict(left, right)
+    written = read_disparity(home / "out" / "0_disparity.png")
+    np.testing.assert_allclose(written, expected.disparity, atol=0.5 / 256 + 1e-4)
+    np.testing.assert_array_equal(read_whole(home / "out" / "0_semantic.png"), expected.semantic)
+    low, high = pair["disparity_px"]
+    assert (low, high) == pytest.approx((expected.disparity.min(), expected.disparity.max()))
+    assert pair["size"] == [96, 64]
+    assert pair["network_ms"] > 0
+    assert b"element vertex 6144\n" in (home / "out" / "0_cloud.ply").read_bytes()
+
+
+def test_folders_give_every_pair(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "left" / "notes.txt").write_text("no image")
+    folders = [str(home / "left"), str(home / "right")]
+    arguments = [
+        *folders,
+        "--model",
+        str(models / "anynet.safetensors"),
+        "--out",
+        str(home / "out"),
+    ]
+    told = report(infer, [*arguments, "--stages", "1"], capsys)
+    assert [(pair["name"], pair["stage"]) for pair in told["pairs"]] == [("0", 1), ("1", 1)]
+    assert len(left_behind(home)) == 4
+
+
+def test_table_tells_what_was_written(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = ("--focal", "100", "--baseline", "0.5")
+    assert infer(infer_arguments(home, models / "anynet.safetensors", *camera)) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for words in ("AnyNet c=1, 3 stages · a test", "96x64", "disparity.png color.png cloud.ply"):
+        assert words in printed.out
+
+
+def test_network_is_warmed_up_and_timed_in_milliseconds(
+    home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow:
+        arch = origin = None
+        runs = 0
+
+        def predict(self, left: np.ndarray, *rest: object) -> Estimate:
+            self.runs += 1
+            return Estimate(left[..., 0].astype(np.float32), None, 0.25, None)
+
+    slow = Slow()
+    monkeypatch.setattr("rts2.model.predictor.open_model", lambda path: slow)
+    folders = [str(home / "left"), str(home / "right")]
+    told = report(infer, [*folders, "--model", "m", "--out", str(home / "out")], capsys)
+    assert [pair["network_ms"] for pair in told["pairs"]] == [250.0, 250.0]
+    assert slow.runs == 3, "two pairs of one size: one warm-up, one run each"
+
+
+def test_disparity_beyond_the_format_is_told(
+    home: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    network = build(Arch(c=1, d_max=48, stages=1, semantic=False))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()  # equal costs: every pixel is in the middle, 23.5 planes of 16 px
+    save(network, tmp_path / "far.safetensors", "a test")
+    assert infer(infer_arguments(home, tmp_path / "far.safetensors")) == 0
+    assert "6144 pixels exceed 255.996 px" in caplog.text
+    assert (read_disparity(home / "out" / "0_disparity.png") == 65535 / 256).all()
+
+
+def broken_models(home: Path, models: Path) -> dict[str, Path]:
+    """Files that are no network, by what is wrong with them."""
+    whole = (models / "full.safetensors").read_bytes()
+    truncated = home / "truncated.safetensors"
+    truncated.write_bytes(whole[: len(whole) // 2])
+    text = home / "text.onnx"
+    text.write_text("hello")
+    value = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 96])
+    out = helper.make_tensor_value_info("out", TensorProto.FLOAT, [1, 3, 64, 96])
+    body = helper.make_graph([helper.make_node("Relu", ["image"], ["out"])], "g", [value], [out])
+    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 13)])
+    model.ir_version = 8
+    onnx.save(model, home / "other.onnx")
+    return {"truncated": truncated, "no onnx": text, "other inputs": home / "other.onnx"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("truncated", "truncated or no safetensors"),
+        ("no onnx", "truncated or no ONNX file"),
+        ("other inputs", "it takes image, tensor(float) [1, 3, 64, 96]"),
+    ],
+)
+@pytest.mark.parametrize("command", [infer, evaluate])
+def test_broken_model(
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: Command,
+    fault: str,
+    words: str,
+) -> None:
+    model = broken_models(home, models)[fault]
+    arguments = infer_arguments if command is infer else evaluate_arguments
+    code, line = refusal(command, arguments(home, model), capsys)
+    assert code == 1
+    assert words in line
+    assert left_behind(home) == []
+
+
+class Evil:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.mark,)
+
+
+@pytest.mark.parametrize("container", ["zip", "protocol 2", "protocol 4"])
+@pytest.mark.parametrize("command", [infer, evaluate])
+def test_malicious_checkpoint_runs_nothing(
+    home: Path, capsys: pytest.CaptureFixture[str], command: Command, container: str
+) -> None:
+    mark, model = home / "mark", home / "model.tar"
+    if container == "zip":
+        torch.save({"state_dict": Evil(mark)}, model)
+    else:
+        protocol = int(container.split()[1])
+        model.write_bytes(pickle.dumps({"state_dict": Evil(mark)}, protocol=protocol))
+        pickle.loads(model.read_bytes())
+        assert mark.exists(), "the file is as malicious as it should be"
+        mark.unlink()
+    arguments = infer_arguments if command is infer else evaluate_arguments
+    code, _ = refusal(command, arguments(home, model), capsys)
+    assert code == 1
+    assert not mark.exists()
+    assert left_behind(home) == []
+
+
+def wrong(home: Path, models: Path) -> dict[str, tuple[list[str], int, str]]:
+    """Wrong uses of rts2-infer: arguments, exit code, words of the line."""
+    model = models / "full.safetensors"
+    good = infer_arguments(home, model)
+    left, right = good[:2]
+    put(home / "small.png", noise(3, 60, 96))
+    put(home / "twins" / "0.png", noise(3))
+    put(home / "twins" / "0.jpg", noise(3))
+    put(home / "one" / "0.png", noise(3))
+    (home / "empty").mkdir()
+    (home / "text.png").write_text("hello")
+    (home / "half.png").write_bytes((home / "left" / "0.png").read_bytes()[:5000])
+    (home / "file").write_text("in the way")
+    (home / "calib.txt").write_text(CALIBRATION.replace("96", "97"))
+    rest = good[2:]
+    folder = str(home / "left")
+    return {
+        "missing image": ([str(home / "none.png"), right, *rest], 2, "no such file"),
+        "no image": ([left, str(home / "text.png"), *rest], 1, "truncated or no image"),
+        "half an image": ([str(home / "half.png"), right, *rest], 1, "truncated or no image"),
+        "two sizes": ([left, str(home / "small.png"), *rest], 2, "0.png is 96x64, "),
+        "folder and image": ([folder, right, *rest], 2, "two images or two folders"),
+        "no partner": ([folder, str(home / "one"), *rest], 2, "has no 1 (2 images against 1)"),
+        "empty folders": ([str(home / "empty")] * 2 + rest, 2, "must hold images"),
+        "twins": ([str(home / "twins")] * 2 + rest, 2, "names must differ"),
+        "stages 0": ([*good, "--stages", "0"], 2, "stages must be 1 to 3"),
+        "stages 4": ([*good, "--stages", "4"], 2, "stages must be 1 to 3"),
+        "stages x": ([*good, "--stages", "x"], 2, "invalid int value"),
+        "no model": ([left, right], 2, "--model is required: a checkpoint"),
+        "missing model": ([left, right, "--model", "none"], 2, "a checkpoint or an ONNX file"),
+        "file for --out": ([*good[:-1], str(home / "file")], 1, "choose another --out"),
+        "folder in a file": ([*good[:-1], str(home / "file" / "x")], 1, "choose another --out"),
+        "half a camera": ([*good, "--focal", "700"], 2, "both --focal PX and --baseline M"),
+        "focal 0": ([*good, "--focal", "0"], 2, "finite number above 0"),
+        "two cameras": (
+            [*good, "--focal", "7", "--calib", str(home / "calib.txt")],
+            2,
+            "leave the others out",
+        ),
+        "other calibration": (
+            [*good, "--calib", str(home / "calib.txt")],
+            2,
+            "it is for 97x64, they are 96x64",
+        ),
+        "missing calibration": ([*good, "--calib", "none"], 2, "a calibration must be a file"),
+    }
+
+
+WRONG = [
+    "missing image",
+    "no image",
+    "half an image",
+    "two sizes",
+    "folder and image",
+    "no partner",
+    "empty folders",
+    "twins",
+    "stages 0",
+    "stages 4",
+    "stages x",
+    "no model",
+    "missing model",
+    "file for --out",
+    "folder in a file",
+    "half a camera",
+    "focal 0",
+    "two cameras",
+    "other calibration",
+    "missing calibration",
+]
+
+
+@pytest.mark.parametrize("fault", WRONG)
+def test_wrong_use_of_infer(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str], fault: str
+) -> None:
+    cases = wrong(home, models)
+    assert list(cases) == WRONG
+    arguments, expected, words = cases[fault]
+    code, line = refusal(infer, arguments, capsys)
+    assert code == expected
+    assert words in line
+    assert not (home / "out").exists()
+    assert (home / "file").read_text() == "in the way"
+
+
+def test_broken_image_in_a_folder_keeps_what_was_done(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = home / "right" / "1.png"
+    image.write_bytes(image.read_bytes()[:5000])
+    folders = [str(home / "left"), str(home / "right")]
+    arguments = [
+        *folders,
+        "--model",
+        str(models / "anynet.safetensors"),
+        "--out",
+        str(home / "out"),
+    ]
+    code, line = refusal(infer, arguments, capsys)
+    assert code == 1
+    assert str(image) in line
+    assert [path.name for path in left_behind(home)] == ["0_color.png", "0_disparity.png"]
+
+
+def test_evaluation_tells_what_is_known(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = report(evaluate, evaluate_arguments(home, models / "full.safetensors"), capsys)
+    assert told["schema"] == "rts2.eval/1"
+    assert (told["crop"], told["foreground"]) == (None, None)
+    assert [entry["stage"] for entry in told["stages"]] == [1, 2, 3]
+    scene = [read_rgb(home / "kitti" / "training" / f"image_{i}" / "000000_10.png") for i in (2, 3)]
+    for entry, image in zip(told["stages"], told["images"], strict=True):
+        estimate = open_model(models / "full.safetensors").predict(*scene, entry["stage"])
+        error = np.abs(estimate.disparity - 10.0)
+        assert entry["epe"] == pytest.approx(error.mean(), rel=1e-4)
+        assert entry["d1_all"] == pytest.approx(100 * (error > 3).mean(), abs=0.1)
+        assert entry["pacc"] == pytest.approx(100 * (estimate.semantic == 0).mean(), abs=0.1)
+        assert entry["miou"] is not None
+        assert (entry["d1_bg"], entry["d1_fg"], entry["iiou"]) == (None, None, None)
+        assert (entry["pixels"], entry["missing"]) == (64 * 96, 0)
+        assert image["name"] == "000000_10"
+        assert (image["stage"], image["epe"]) == (entry["stage"], entry["epe"])
+
+
+def test_evaluation_splits_by_the_instances(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    instances = np.full((64, 96), 26 * 256, np.uint16)
+    instances[:, :48] += 1
+    put(home / "kitti" / "training" / "instance" / "000000_10.png", instances)
+    arguments = evaluate_arguments(home, models / "anynet.safetensors", "--stages", "2")
+    told = report(evaluate, arguments, capsys)
+    assert told["foreground"] == "instance"
+    assert len(told["stages"]) == 2
+    for entry in told["stages"]:
+        assert entry["d1_all"] == pytest.approx((entry["d1_fg"] + entry["d1_bg"]) / 2)
+        assert entry["miou"] is None
+
+
+def test_crop_judges_the_bottom_right(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = evaluate_arguments(home, models / "anynet.safetensors", "--crop", "48x32")
+    told = report(evaluate, arguments, capsys)
+    assert told["crop"] == [48, 32]
+    assert {entry["pixels"] for entry in told["stages"]} == {48 * 32}
+
+
+def test_evaluation_table(home: Path, models: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(evaluate_arguments(home, models / "anynet.safetensors")) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "anynet.safetensors · AnyNet c=1, 3 stages · a test · kitti2015"
+    assert "D1-all %" in lines[1]
+    assert sum(line.startswith("000000_10") for line in lines) == 3
+    assert sum(line.startswith("all pixels") for line in lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("more", "code", "words"),
+    [
+        (["--crop", "97x64"], 2, "97x64 does not fit in 000000_10 of 96x64"),
+        (["--crop", "12"], 2, "must be WxH"),
+        (["--stages", "4"], 2, "stages must be 1 to 3"),
+        (["--data", "none"], 2, "no such folder"),
+        (["--dataset", "kitti2042"], 2, "kitti2015"),
+    ],
+)
+def test_wrong_use_of_evaluate(
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    more: list[str],
+    code: int,
+    words: str,
+) -> None:
+    arguments = evaluate_arguments(home, models / "anynet.safetensors", *more)
+    found, line = refusal(evaluate, arguments, capsys)
+    assert found == code
+    assert words in line
+
+
+RELEASED = {
+    "kitti2015": {
+        "000000_10": ([1.59, 1.46, 1.22], [12.62, 12.38, 8.79]),
+        "000001_10": ([1.89, 1.50, 1.22], [12.53, 8.94, 6.29]),
+        "000002_10": ([1.99, 1.52, 1.23], [17.14, 9.73, 7.09]),
+    },
+    "sceneflow": {
+        "000000_10": ([3.34, 3.10, 3.12], [40.22, 36.95, 33.31]),
+        "000001_10": ([3.19, 2.85, 2.74], [33.18, 27.99, 25.26]),
+        "000002_10": ([4.74, 4.88, 5.21], [44.53, 45.29, 46.52]),
+    },
+}
+"""EPE and D1-all of the official AnyNet code, stages 1 to 3, on the 1232x368 crop."""
+
+
+@pytest.mark.parametrize("weights", sorted(RELEASED))
+def test_released_checkpoints_give_the_official_figures(
+    real_data: Path, capsys: pytest.CaptureFixture[str], weights: str
+) -> None:
+    model = real_data / "anynet_official" / f"{weights}.tar"
+    data = ["--dataset", "kitti2015", "--data", str(real_data / "kitti2015")]
+    told = report(evaluate, [str(model), *data, "--crop", "1232x368"], capsys)
+    for name, (epe, d1) in RELEASED[weights].items():
+        found = [entry for entry in told["images"] if entry["name"] == name]
+        assert [entry["epe"] for entry in found] == pytest.approx(epe, abs=0.01)
+        assert [entry["d1_all"] for entry in found] == pytest.approx(d1, abs=0.05)
+    assert told["foreground"] == "instance"
+    assert all(entry["d1_bg"] is not None for entry in told["stages"])

@@ -1,0 +1,61 @@
+"""Colours and overlays against values worked out by hand."""
+
+import numpy as np
+from matplotlib import colormaps
+
+from rts2.model.pictures import (
+    PALETTE,
+    coloured,
+    overlay,
+    painted,
+)
+
+NAN = np.nan
+
+
+def turbo(share: float) -> list[int]:
+    return [round(255 * part) for part in colormaps["turbo"](share)[:3]]
+
+
+def disparities(*values: float) -> np.ndarray:
+    return np.array([values], np.float32)
+
+
+def test_colours_run_from_zero_to_the_given_maximum() -> None:
+    picture = coloured(disparities(0, 50, 100, 200, -5), 100.0)
+    assert picture.dtype == np.uint8
+    wanted = [turbo(0.0), turbo(0.5), turbo(1.0), turbo(1.0), turbo(0.0)]
+    np.testing.assert_allclose(picture[0], wanted, atol=1)
+
+
+def test_unknown_is_black() -> None:
+    picture = coloured(disparities(NAN, 3, np.inf), 10.0)
+    assert picture[0, 0].tolist() == picture[0, 2].tolist() == [0, 0, 0]
+    assert picture[0, 1].any()
+    assert not coloured(disparities(NAN, NAN)).any()
+
+
+def test_scale_ends_at_the_98th_percentile() -> None:
+    ramp = np.arange(101, dtype=np.float32)[None]
+    np.testing.assert_array_equal(coloured(ramp), coloured(ramp, 98.0))
+    unknown = np.concatenate([ramp, np.full((1, 500), NAN, np.float32)], axis=1)
+    np.testing.assert_array_equal(coloured(unknown)[:, :101], coloured(ramp))
+
+
+def test_flat_zero_has_one_colour() -> None:
+    np.testing.assert_allclose(coloured(disparities(0, 0))[0], [turbo(0.0)] * 2, atol=1)
+
+
+def test_classes_have_the_colours_of_cityscapes() -> None:
+    road, sky, car = painted(np.array([[0, 10, 13]], np.uint8))[0].tolist()
+    assert (road, sky, car) == ([128, 64, 128], [70, 130, 180], [0, 0, 142])
+    assert not painted(np.array([[19, 255]], np.uint8)).any()
+    assert len({tuple(colour) for colour in PALETTE.tolist()}) == 19
+
+
+def test_overlay_mixes_and_leaves_unlabelled_pixels() -> None:
+    image = np.array([[[100, 100, 100], [9, 8, 7]]], np.uint8)
+    mixed = overlay(image, np.array([[0, 255]], np.uint8))
+    assert mixed.tolist() == [[[114, 82, 114], [9, 8, 7]]]
+    full = overlay(image, np.array([[0, 255]], np.uint8), share=1.0)
+    assert full[0, 0].tolist() == [128, 64, 128]
