@@ -63,7 +63,9 @@ def load(path: Path) -> tuple[Network, Header]:
     """
     existing_file(path, "a checkpoint")
     with path.open("rb") as handle:
-        pickled = handle.read(2) in (b"PK", b"\x80\x02")
+        head = handle.read(9)
+    # A safetensors file starts with the length of its header, which may look like either mark.
+    pickled = head[:2] in (b"PK", b"\x80\x02") and head[8:] != b"{"
     network, header = _import_anynet(path) if pickled else _load_own(path)
     broken = [name for name, value in network.state_dict().items() if not _finite(value)]
     if broken:
@@ -122,7 +124,7 @@ def _import_anynet(path: Path) -> tuple[Network, Header]:
             f"{path} is a pickle that holds more than tensors and could run code; "
             "load it where you trust it and save its state_dict with safetensors"
         ) from error
-    except (RuntimeError, EOFError, KeyError, TypeError, AttributeError, ValueError) as error:
+    except Exception as error:  # a broken file raises whatever torch's reader stumbles over
         raise Rts2Error(
             f"{path} is truncated or not a released AnyNet checkpoint; give one of those, "
             "or a checkpoint that rts2 wrote"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from copy import deepcopy
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -79,7 +80,7 @@ def export(
     """
     if opset not in OPSETS:
         raise UsageError(f"opset must be {OPSETS[0]} to {OPSETS[-1]}, not {opset}")
-    deployed = Deployed(network, stages)
+    deployed = Deployed(deepcopy(network), stages).eval()  # the exporter plays with its modes
     height, width = padded(resolution, deployed.arch.multiple)
     header = GraphHeader(
         arch=deployed.arch,
@@ -97,7 +98,7 @@ def parity(path: Path, network: Network, left: Tensor, right: Tensor) -> Parity:
 
     `left`, `right`: (1, 3, H, W) at the graph's input size.
     """
-    deployed = Deployed(network, read_header(path).stages).eval()
+    deployed = Deployed(deepcopy(network), read_header(path).stages).eval()
     with torch.inference_mode():
         expected = [output.numpy() for output in deployed(left, right)]
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import onnx
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from pydantic import BaseModel, ConfigDict
 
-from .arch import Arch
+from .arch import MEAN, STD, Arch, Precision
 from .errors import Rts2Error
 from .files import existing_file, parse_json, write_bytes
 
-Precision = Literal["fp32", "fp16", "int8"]
-
 HEADER = "rts2"
 """The key of our entry in the file's metadata."""
-
-MEAN = (0.485, 0.456, 0.406)
-STD = (0.229, 0.224, 0.225)
-"""ImageNet's, for RGB in 0 … 1: what every network here expects its images normalised with."""
 
 
 class GraphHeader(BaseModel):
