@@ -1,0 +1,109 @@
+"""How far a quantized network is from its float one: noise in dB, and errors on the same pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.data.images import Scene
+from ..model.errors import Rts2Error
+from ..model.metrics import Score
+from ..model.predictor import Estimate, Predictor, judge
+
+SHIFT_PX = 24
+"""The disparity of the synthetic pair, within reach of every network (d_max of 2 and more)."""
+
+
+class Measured(NamedTuple):
+    """Both networks on the same scenes."""
+
+    reference: Score
+    other: Score
+    sqnr_db: float
+    """Of the disparities of all scenes together; infinite when they are equal."""
+
+
+def sqnr_db(reference: NDArray[Any], other: NDArray[Any]) -> float:
+    """Signal to quantization noise: 10·log10(Σ reference² / Σ (reference − other)²).
+
+    Infinite where both are equal. Raises `Rts2Error` for arrays of different shapes.
+    """
+    if reference.shape != other.shape:
+        raise Rts2Error(f"both must have one shape: {reference.shape}, {other.shape}")
+    return _decibels(*_powers(reference, other))
+
+
+def measure(reference: Predictor, other: Predictor, scenes: Iterable[Scene]) -> Measured:
+    """Runs two networks on every scene, scores both, and compares their disparities.
+
+    Raises `Rts2Error` where `other` fails, or gives values that are not finite.
+    """
+    scores = [Score(), Score()]
+    powers = np.zeros(2)
+    for scene in scenes:
+        estimates = reference.predict(scene.left, scene.right), _finite(other, scene)
+        powers += _powers(estimates[0].disparity, estimates[1].disparity)
+        for index, (model, estimate) in enumerate(zip((reference, other), estimates, strict=True)):
+            scores[index] += judge(_Answered(model, estimate), scene)[estimate.stage]
+    return Measured(scores[0], scores[1], _decibels(*powers))
+
+
+def synthetic_scene(resolution: tuple[int, int]) -> Scene:
+    """A smooth random texture and the same moved by `SHIFT_PX`, always the same; no truth known."""
+    width, height = resolution
+    texture = _smooth(np.random.default_rng(0).random((height, width + SHIFT_PX, 3)))
+    pixels = np.rint(255 * (texture - texture.min()) / np.ptp(texture)).astype(np.uint8)
+    return Scene(
+        name="one synthetic pair",
+        left=pixels[:, :width],
+        right=pixels[:, SHIFT_PX:],
+        truth=np.full((height, width), np.nan, np.float32),
+    )
+
+
+def _finite(model: Predictor, scene: Scene) -> Estimate:
+    """The answer of a network that may overflow; where it does, a runtime may fail altogether."""
+    remedy = "in this precision the network leaves the range of its numbers; keep fp32"
+    try:
+        estimate = model.predict(scene.left, scene.right)
+    except Rts2Error as error:
+        raise Rts2Error(f"{scene.name}: {remedy}") from error
+    if not np.isfinite(estimate.disparity).all():
+        raise Rts2Error(f"{scene.name}: {remedy}")
+    return estimate
+
+
+class _Answered:
+    """A predictor that has its answer already: it can be judged without a second run."""
+
+    def __init__(self, model: Predictor, estimate: Estimate) -> None:
+        self.arch = model.arch
+        self.origin = model.origin
+        self.estimate = estimate
+
+    def predict(self, *_: object) -> Estimate:
+        return self.estimate
+
+    def predict_stages(self, *_: object) -> list[Estimate]:
+        return [self.estimate]
+
+
+def _powers(reference: NDArray[Any], other: NDArray[Any]) -> tuple[float, float]:
+    """The power of the signal and that of the noise."""
+    signal = reference.astype(np.float64)
+    return float(np.square(signal).sum()), float(np.square(signal - other).sum())
+
+
+def _decibels(signal: float, noise: float) -> float:
+    with np.errstate(divide="ignore"):
+        return float(10 * (np.log10(signal) - np.log10(noise))) if noise else float("inf")
+
+
+def _smooth(noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A 7×7 mean, twice: structure of a few pixels, as real images have it."""
+    for axis in (0, 1, 0, 1):
+        noise = sum((np.roll(noise, shift, axis) for shift in range(-3, 4)), np.zeros_like(noise))
+    return noise
