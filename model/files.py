@@ -55,6 +55,14 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
+def remove(path: Path) -> None:
+    """Removes the file at `path`, if there is one."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
 def output_folder(path: Path) -> Path:
     """`path`, created where missing and known to be writable."""
     try:

@@ -23,7 +23,7 @@ def fit(points: Sequence[Point], form: LatencyModel) -> LatencyModel:
     The sum form is linear and starts the search; the max form is refined from there.
 
     Raises:
-        Rts2Error: fewer points than coefficients.
+        Rts2Error: fewer points than coefficients, or a coefficient that no point exercises.
     """
     steps, truth = _table(points)
     return _fit(steps, truth, form)
@@ -49,6 +49,12 @@ def calibrated(profile: Profile, form: LatencyModel, known: Calibration) -> Cali
 
 def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
     """ln(true / predicted) of each point, predicted by a fit on all the others."""
+    needed = len(form.ms_per) + 2
+    if len(points) < needed:
+        raise Rts2Error(
+            f"{needed - 1} coefficients need at least {needed} timings to leave one out, "
+            f"not {len(points)}"
+        )
     residuals = []
     for index, point in enumerate(points):
         others = [*points[:index], *points[index + 1 :]]
@@ -69,7 +75,9 @@ def _fit(steps: Steps, truth: Floats, form: LatencyModel) -> LatencyModel:
         )
     columns = np.stack([latencies_ms(unit, steps) for unit in _units(form)], 1)
     scale = (columns / truth[:, None]).max(0)
-    scale[scale == 0] = 1.0
+    idle = [name for name, most in zip(("start", *form.ms_per), scale, strict=True) if most == 0]
+    if idle:
+        raise Rts2Error(f"no timing exercises {idle[0]}; time networks that do")
     start, _ = nnls(columns / truth[:, None] / scale, np.ones(len(truth)))
 
     def misses(values: NDArray[np.float64]) -> Floats:

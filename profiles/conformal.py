@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil
+from math import ceil, floor
 
 from ..model.errors import UsageError
 
@@ -21,8 +21,9 @@ def half_width(residuals: Sequence[float], confidence: float) -> float:
     count = len(residuals)
     rank = ceil((count + 1) * confidence - 1e-9)
     if rank > count:
+        limit = floor(1000 * count / (count + 1)) / 10
         raise UsageError(
-            f"{count} calibration points bound nothing above {count / (count + 1):.0%} "
-            f"confidence, and {confidence:.0%} was asked for"
+            f"{count} calibration points bound nothing above {limit:g}% confidence, "
+            f"and {100 * confidence:g}% was asked for; ask for {limit:g}% or less"
         )
     return sorted(abs(residual) for residual in residuals)[max(rank, 1) - 1]

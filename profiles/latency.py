@@ -20,7 +20,7 @@ from ..model.arch import Arch
 from ..model.ops import Kind, Op, ops
 
 Floats = NDArray[np.float64]
-Milliseconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Milliseconds = Annotated[float, Field(ge=0, le=1e6)]
 
 CHANNEL_BLOCK = 16
 """Single-precision channels in one AVX-512 register: CPU kernels compute whole blocks."""

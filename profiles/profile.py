@@ -80,9 +80,16 @@ class Calibration(Frozen):
     runtime: Runtime
     precision: Precision
     model: LatencyModel
-    residuals: tuple[float, ...]
+    residuals: tuple[Annotated[float, Field(ge=-7, le=7)], ...]
     """Leave-one-out ln(true / predicted), in the order of the points."""
     source: str
+
+    @field_validator("model")
+    @classmethod
+    def _something(cls, value: LatencyModel) -> LatencyModel:
+        if not any([value.start_ms, *value.ms_per.values()]):
+            raise ValueError("one coefficient at least must be above 0")
+        return value
 
 
 class Derivation(Frozen):
@@ -107,6 +114,12 @@ class Derivation(Frozen):
                 f"{unknown[0]} is no coefficient; known are {START}, {', '.join(FEATURES)}"
             )
         return value
+
+    @model_validator(mode="after")
+    def _something(self) -> Derivation:
+        if not self.factors and not self.folded:
+            raise ValueError("factors or folded must say what changes against the base")
+        return self
 
     def scale(self, model: LatencyModel) -> LatencyModel:
         """`model` with this derivation's factors applied."""
@@ -143,6 +156,17 @@ class Profile(Frozen):
     derivations: tuple[Derivation, ...] = ()
     points: tuple[Point, ...]
     machine: Machine | None = None
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Profile:
+        models = [f"{known.runtime} {known.precision}" for known in self.calibrations]
+        models += [f"{derived.runtime} {derived.precision}" for derived in self.derivations]
+        precisions: list[str] = [support.precision for support in self.precisions]
+        for names in (models, precisions):
+            repeated = [name for name in names if names.count(name) > 1]
+            if repeated:
+                raise ValueError(f"{repeated[0]} occurs twice")
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> Profile:

@@ -85,12 +85,22 @@ class PublishedRows(BaseModel):
 
 
 class MeasuredRows(BaseModel):
-    """Accuracies that a user measured, one row per arch and precision."""
+    """Accuracies that a user measured, one row an arch."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     schema_: Literal["rts2.accuracy/1"] = Field(alias="schema")
     rows: Annotated[tuple[Row, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> MeasuredRows:
+        archs = [row.arch for row in self.rows]
+        for at, row in enumerate(self.rows):
+            if row.arch in archs[:at]:
+                raise ValueError(f"rows.{at} names {row.arch.label()} twice")
+            if all(row.value(metric) is None for metric in METRICS):
+                raise ValueError(f"rows.{at} measures nothing; give one of {', '.join(METRICS)}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -109,6 +119,10 @@ class AccuracySource(Protocol):
     @property
     def exact_evidence(self) -> Literal["published", "measured"]:
         """What a row of the source counts as."""
+
+    @property
+    def named(self) -> tuple[Arch, ...]:
+        """The networks that a user named himself, so that none is dropped in silence."""
 
     def columns(self, space: Space, stages: int) -> Accuracy:
         """The accuracy of every arch of one block."""
@@ -139,6 +153,7 @@ class Published:
 
     table: PublishedRows
     exact_evidence: Literal["published"] = "published"
+    named: tuple[Arch, ...] = ()
 
     def columns(self, space: Space, stages: int) -> Accuracy:
         """NaN for 3D widths other than the paper's, and where no row says anything."""
@@ -222,6 +237,10 @@ class Measured:
 
     table: MeasuredRows
     exact_evidence: Literal["measured"] = "measured"
+
+    @property
+    def named(self) -> tuple[Arch, ...]:
+        return tuple(row.arch for row in self.table.rows)
 
     def columns(self, space: Space, stages: int) -> Accuracy:
         """NaN wherever no row names the network."""

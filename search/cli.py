@@ -19,7 +19,7 @@ from ..model.console import (
     screen,
 )
 from ..model.errors import NothingFeasible, UsageError
-from ..model.files import output_folder, replacing_folder, write_bytes, write_json
+from ..model.files import output_folder, remove, replacing_folder, write_bytes, write_json
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import source
 from .deploy.bundle import next_step, runtime_of, write
@@ -129,7 +129,7 @@ def _write(found: Found, profile: Profile, out: Path) -> list[str]:
     save(found, profile.title, out / "front.png")
     written = [f"{out}/", "front.json", "front.csv", "front.png"]
     if found.selected is None:
-        (out / "deployment.json").unlink(missing_ok=True)
+        remove(out / "deployment.json")
         return written
     configuration = of_point(found.selected, found, profile)
     write_json(out / "deployment.json", configuration.model_dump(mode="json", by_alias=True))
@@ -234,7 +234,7 @@ def _infeasible(found: Found, profile: Profile) -> str:
     if found.prospect is not None:
         point = found.prospect
         return (
-            f"{asked}; {point.fps:.1f} FPS is extrapolated for {point.arch.label()} "
+            f"{asked}; the prospect has {point.fps:.1f} FPS: {point.arch.label()} "
             "(--allow-extrapolated takes it)"
         )
     if found.nearest is None:

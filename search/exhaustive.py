@@ -99,11 +99,14 @@ def search(question: Question, source: AccuracySource, space: Space | None = Non
     """Every candidate of `space`, the front, the pick and the prospect.
 
     Raises:
-        UsageError: a precision or runtime that the device refuses or lacks, or a confidence that
-            its calibration points cannot give.
+        UsageError: a precision or runtime that the device refuses or lacks, a confidence that
+            its calibration points cannot give, or a measured network outside of the space.
     """
     started = time.perf_counter()
     space = space or Space()
+    for arch in source.named:
+        if space.position(arch) is None:
+            raise UsageError(f"{arch.label()} was measured, and lies outside of the space")
     executors = _executors(question)
     totals = _Totals(space)
     found: list[_Columns] = []
@@ -138,18 +141,23 @@ class _Choices(TypedDict):
 
 
 def _choices(question: Question, front: list[Point]) -> _Choices:
-    """The pick on proven numbers, what extrapolated latency could win, the fastest otherwise."""
-    every = question.allow_extrapolated
-    proven = [point for point in front if every or point.proven]
-    timed = [point for point in front if every or point.evidence.accuracy != "extrapolated"]
-    selected, prospect = (
-        pick(points, question.target_fps, question.objective, question.at_lower_bound)
-        for points in (proven, timed)
-    )
+    """The pick on proven numbers, what extrapolation could win, the fastest where none meets.
+
+    The prospect trusts extrapolated latency, and extrapolated accuracy only where no other is.
+    """
+    proven = [point for point in front if point.proven]
+    timed = [point for point in front if point.evidence.accuracy != "extrapolated"]
+
+    def best(points: list[Point]) -> Point | None:
+        return pick(points, question.target_fps, question.objective, question.at_lower_bound)
+
+    allowed = question.allow_extrapolated
+    prospect = best(timed) or best(front)
+    selected = prospect if allowed else best(proven)
     return {
         "selected": selected,
         "prospect": prospect,
-        "nearest": None if selected else fastest(front),
+        "nearest": None if selected else next(iter(front), None) if allowed else fastest(front),
     }
 
 
@@ -292,30 +300,40 @@ class _Block:
         latency = self.latency_ms.copy()
         inside = self.space.inside(self.stages, box)
         evidence = np.where(inside, EVIDENCE.index("interpolated"), EXTRAPOLATED)
-        for timing in self._timings():
-            position = self.space.position(timing.arch)
-            same = _size(timing.resolution) == _size(self.question.resolution)
-            if position is not None and timing.arch.stages == self.stages and same:
-                latency[position] = timing.latency_ms
-                evidence[position] = EVIDENCE.index(timing.evidence)
+        known = [
+            (position, timing)
+            for timing in self._timings()
+            if timing.arch.stages == self.stages
+            and _size(timing.resolution) == _size(self.question.resolution)
+            and (position := self.space.position(timing.arch)) is not None
+        ]
+        for position, timing in known:
+            if timing.evidence == "published":
+                _bound(latency, position, timing.latency_ms)
+        for position, timing in known:
+            latency[position] = timing.latency_ms
+            evidence[position] = EVIDENCE.index(timing.evidence)
         return latency, evidence
 
     def _half_width(self, at: NDArray[np.int64], extrapolated: Flags) -> Floats:
         """The interval's half width in natural logarithm, for the positions `at`.
 
-        Where the model extrapolates, half of the log distance to the nearest calibrated network
-        is in doubt on top: a promised speed-up of two could be 1.4 or 2.8.
+        Where the model extrapolates, each step away from what was calibrated (to this executor,
+        to this resolution, to this arch) changes the latency by a factor, and half of its
+        logarithm is in doubt on top: a promised speed-up of two could be 1.4 or 2.8. What nobody
+        timed is at least twice as unsure as what somebody did.
         """
         sure = half_width(self.executor.base.residuals, self.question.confidence)
         if not extrapolated.any():
             return np.full(len(at), sure)
-        speed_up = np.log(self.latency_ms.reshape(-1)[at] / self._anchor_ms(at))
-        return np.where(extrapolated, sure + 0.5 * np.abs(speed_up), sure)
+        steps = np.abs(np.diff(np.log(self._way_from_calibrated(at)), axis=0))
+        return np.where(extrapolated, sure + np.maximum(0.5 * steps.sum(0), sure), sure)
 
-    def _anchor_ms(self, at: NDArray[np.int64]) -> Floats:
-        """For the archs at `at`, the latency of the nearest arch that the calibration spans.
+    def _way_from_calibrated(self, at: NDArray[np.int64]) -> Floats:
+        """Latencies of the archs at `at`, one step after the other, (4, n).
 
-        Widths of stages that only the calibrated block has are moved into its box.
+        From the nearest arch that the calibration spans to the arch itself, to its resolution, to
+        its executor. Widths of stages that only the calibrated block has are moved into its box.
         """
         known = boxes(timing.arch for timing in self._timings())
         stages = min(known, key=lambda count: (abs(count - self.stages), -count))
@@ -323,21 +341,39 @@ class _Block:
             {timing.resolution for timing in self._timings()},
             key=lambda size: abs(np.log(_pixels(size) / _pixels(self.question.resolution))),
         )
-        whole = self.totals.latency_ms(self.executor.base.model, resolution, stages)
+        base = self.executor.base.model
         own = np.unravel_index(at, self.shape)
         nearest = self.space.nearest(stages, known[stages])
         absent = (np.zeros_like(at),) * max(len(nearest) - len(own), 0)
         moved = zip(nearest, (*own, *absent), strict=False)
-        anchors: Floats = whole[tuple(positions[index] for positions, index in moved)]
-        return anchors
+        inside = tuple(positions[index] for positions, index in moved)
+        return np.stack(
+            [
+                self.totals.latency_ms(base, resolution, stages)[inside],
+                self.totals.latency_ms(base, resolution, self.stages)[own],
+                self.totals.latency_ms(base, self.question.resolution, self.stages)[own],
+                self.latency_ms[own],
+            ]
+        )
 
     def _timings(self) -> tuple[Timing, ...]:
         base = self.executor.base
-        return self.question.profile.points_of(base.runtime, base.precision)
+        points = self.question.profile.points_of(base.runtime, base.precision)
+        return tuple(point for point in points if point.arch.family == "rts2net")
 
     def _resolution_known(self) -> bool:
         sizes = [_pixels(timing.resolution) for timing in self._timings()]
         return min(sizes) <= _pixels(self.question.resolution) <= max(sizes)
+
+
+def _bound(latency: Floats, position: tuple[int, ...], known_ms: float) -> None:
+    """Keeps a block in order with one published network: none that holds it is faster, none that
+    it holds is slower. Every axis of a block ascends.
+    """
+    larger = tuple(slice(at, None) for at in position)
+    smaller = tuple(slice(at + 1) for at in position)
+    latency[larger] = np.maximum(latency[larger], known_ms)
+    latency[smaller] = np.minimum(latency[smaller], known_ms)
 
 
 def _size(resolution: Resolution) -> Size:
@@ -363,6 +399,8 @@ def _front(
     )
     direction = 1 if LOWER_IS_BETTER[question.objective] else -1
     accuracy = direction * metrics[:, METRICS.index(question.objective)]
+    if question.at_lower_bound:
+        latency = latency * np.exp(np.concatenate([columns.half_width for columns in found]))
     kept = nondominated(np.column_stack([latency, accuracy, evidence == EXTRAPOLATED]))
     points: list[Point] = []
     start = 0
@@ -401,7 +439,7 @@ def _points(
             precision=executor.precision,
             runtime=executor.runtime,
             latency_ms=latency,
-            fps=1000 / latency,
+            fps=float(f"{1000 / latency:.12g}"),  # a published 60.4 comes back as 60.4
             fps_low=1000 / latency * exp(-half),
             fps_high=1000 / latency * exp(half),
             params=int(weights[flat]),

@@ -16,7 +16,7 @@ from .result import Point
 def nondominated(objectives: Floats) -> NDArray[np.bool_]:
     """Which rows no other row beats, all objectives to be minimized: (n, objectives) → (n,).
 
-    Of equal rows the first stays. O(n log n) for up to three objectives (moocore).
+    Of equal rows the first stays (moocore's dimension-sweep in C).
     """
     if len(objectives) == 0:
         return np.zeros(0, dtype=bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,7 +28,8 @@ MARKERS: dict[Evidence, str] = {
 def save(found: Found, title: str, path: Path) -> None:
     """Draws the front and writes it as PNG, whole or not at all."""
     figure = draw(found, title)
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a title may be in any script
         figure.savefig(temporary, dpi=110)
 
 
@@ -116,7 +118,7 @@ def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None
 def _frame(axes: Axes, found: Found, title: str) -> None:
     width, height = found.resolution
     better = "lower" if LOWER_IS_BETTER[found.objective] else "higher"
-    axes.set_title(headline(found, title), loc="left", fontsize=11, pad=18)
+    axes.set_title(headline(found, title), loc="left", fontsize=11, pad=18, parse_math=False)
     axes.set_xlabel(
         f"frames per second at {width}×{height}, batch 1, network alone "
         f"(bars: {found.confidence:.0%} interval)"

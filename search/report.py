@@ -10,6 +10,7 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from ..profiles.evidence import Evidence
 from ..profiles.profile import Profile, Runtime
 from .accuracy import METRICS, Metric
 from .result import Found, Point
@@ -58,8 +59,8 @@ def headline(found: Found, title: str) -> str:
 def show(found: Found, profile: Profile, written: Sequence[str], console: Console) -> None:
     """Prints the table of the front, the pick, the prospect, and what was left out."""
     scope = f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
-    console.print(f"{headline(found, profile.title)} · {scope}\n", highlight=False)
-    console.print(_table(found))
+    console.print(f"{headline(found, profile.title)} · {scope}\n", highlight=False, markup=False)
+    console.print(_table(found, console.width))
     lines = [*_verdict(found, profile), *_left_out(found), *_notes(found, profile)]
     for label, text in [*lines, ("written", "  ".join(written))]:
         row = Table.grid(padding=(0, 2))
@@ -69,31 +70,44 @@ def show(found: Found, profile: Profile, written: Sequence[str], console: Consol
         console.print(row)
 
 
-def _table(found: Found) -> Table:
-    """The shown points; a column that says the same of all of them becomes a line below."""
-    proven = [point for point in found.front if point.proven]
-    shown = _thinned(proven or list(found.front), found)
+def _table(found: Found, width: int) -> Table:
+    """The shown points; what all of them agree on becomes a line below."""
+    shown = _thinned(_believable(found), found)
     rows = [_row(point) for point in shown]
-    constant = {
-        name: values[0]
-        for name, *values in zip(COLUMNS, *rows, strict=True)
-        if len(rows) > 1 and len(set(values)) == 1 and name in DROPPABLE
-    }
-    table = Table(box=None, header_style="bold", pad_edge=False, caption_justify="left")
-    table.add_column(" ")
-    for name in COLUMNS:
-        if name not in constant:
-            side: JustifyMethod = "left" if name in LEFT else "right"
-            table.add_column(name.format(f"{found.confidence:.0%}"), justify=side, no_wrap=True)
-    for point, row in zip(shown, rows, strict=True):
-        cells = [cell for name, cell in zip(COLUMNS, row, strict=True) if name not in constant]
+    cells = dict(zip(COLUMNS, zip(*rows, strict=True), strict=True)) if rows else {}
+    constant = {n: cells[n][0] for n in CONSTANT if len(rows) > 1 and len(set(cells[n])) == 1}
+    columns = [name for name in COLUMNS if name not in constant]
+    columns = _fitting(columns, rows, found.objective, width) if rows else columns
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column(" ", no_wrap=True)
+    for name in columns:
+        side: JustifyMethod = "left" if name in LEFT else "right"
+        table.add_column(name, justify=side, no_wrap=True)
+    for at, point in enumerate(shown):
         picked = point == found.selected
-        table.add_row("▶" if picked else " ", *cells, style="bold" if picked else "")
-    hidden = len(found.front) - len(shown)
-    same = ", ".join(f"{name} {value}" for name, value in constant.items() if value != "–")
-    told = [f"all with {same}" if same else "", f"{hidden} more points in the files" * bool(hidden)]
-    table.caption = "; ".join(text for text in told if text) or None
+        row = ["▶" if picked else " ", *(cells[name][at] for name in columns)]
+        table.add_row(*row, style="bold" if picked else "")
+    table.caption = _caption(found, constant, len(found.front) - len(shown))
+    table.caption_justify = "left"
     return table
+
+
+def _caption(found: Found, constant: dict[str, str], hidden: int) -> str:
+    """What the table leaves unsaid."""
+    same = ", ".join(f"{name} {value}" for name, value in constant.items())
+    parts = [f"all with {same}"] if same else []
+    parts += [f"{hidden} more points in the files"] if hidden else []
+    letters = ", ".join(f"{letter} {evidence}" for evidence, letter in LETTERS.items())
+    parts.append(f"{found.confidence:.0%} interval; evidence of FPS and accuracy: {letters}")
+    return "\n".join(parts)
+
+
+def _believable(found: Found) -> list[Point]:
+    """The points on the pick's evidence or better; without a pick, on the best that there is."""
+    proven = [point for point in found.front if point.proven]
+    known = [point for point in found.front if point.evidence.accuracy != "extrapolated"]
+    levels = [level for level in (proven, known, list(found.front)) if level]
+    return next((level for level in levels if found.selected in level), [*levels, []][0])
 
 
 COLUMNS = (
@@ -101,23 +115,30 @@ COLUMNS = (
     "stages",
     "branches",
     "d_max",
-    "3D widths",
+    "3D",
     "precision",
     "runtime",
-    "FPS ({})",
+    "FPS",
+    "interval",
     "D1-all",
     "EPE",
     "mIoU",
     "evidence",
 )
-LEFT = ("branches", "3D widths", "precision", "runtime", "evidence")
-DROPPABLE = ("d_max", "precision", "runtime", "EPE", "mIoU")
+LEFT = ("branches", "3D", "precision", "runtime", "evidence")
+CONSTANT = ("d_max", "precision", "runtime")
+"""Told below the table where all rows agree."""
+LETTERS: dict[Evidence, str] = {
+    "published": "p",
+    "measured": "m",
+    "interpolated": "i",
+    "extrapolated": "x",
+}
 
 
 def _row(point: Point) -> list[str]:
     """The cells of `COLUMNS`."""
     arch, told = point.arch, point.evidence
-    latency, accuracy = told.latency, told.accuracy
     return [
         str(arch.c),
         str(arch.stages),
@@ -126,10 +147,23 @@ def _row(point: Point) -> list[str]:
         "/".join(str(width) for width in arch.conv3d),
         point.precision,
         RUNTIMES[point.runtime],
-        f"{point.fps:.1f} ({point.fps_low:.1f}–{point.fps_high:.1f})",
+        f"{point.fps:.1f}",
+        f"{point.fps_low:.1f}–{point.fps_high:.1f}",
         *(number(metric, point.metric(metric)) for metric in METRICS[:3]),
-        latency if latency == accuracy else f"{latency} FPS, {accuracy} accuracy",
+        f"{LETTERS[told.latency]} {LETTERS[told.accuracy]}",
     ]
+
+
+def _fitting(columns: list[str], rows: list[list[str]], objective: Metric, width: int) -> list[str]:
+    """`columns` less what a narrow terminal has no room for; the files have them all."""
+    cells = dict(zip(COLUMNS, zip(*rows, strict=True), strict=True))
+    for spare in ("EPE", "mIoU", "D1-all", "stages", "interval"):
+        needed = sum(1 + max(map(len, (name, *cells[name]))) for name in columns)
+        if 2 + needed <= width:
+            break
+        if spare != NAMES[objective]:
+            columns = [name for name in columns if name != spare]
+    return columns
 
 
 def _thinned(points: list[Point], found: Found) -> list[Point]:
@@ -146,17 +180,15 @@ def _thinned(points: list[Point], found: Found) -> list[Point]:
 
 def _verdict(found: Found, profile: Profile) -> list[tuple[str, str]]:
     lines = [("pick", _sentence(found, found.selected) if found.selected else _no_pick(found))]
-    if found.prospect is not None and found.prospect != found.selected:
-        low, high = found.prospect.fps_low, found.prospect.fps_high
-        doubt = f"{found.prospect.fps:.1f} FPS (extrapolated, {low:.1f}–{high:.1f})"
-        lines.append(
-            (
-                "prospect",
-                f"{name_of(found.prospect)} · {doubt} · "
-                f"{caption(found.objective, found.prospect.metric(found.objective))}; "
-                f"timing it on your {profile.title} would tell, or --allow-extrapolated",
-            )
-        )
+    prospect = found.prospect
+    if prospect is not None and prospect != found.selected:
+        doubt = f"{prospect.evidence.latency}, {prospect.fps_low:.1f}–{prospect.fps_high:.1f}"
+        accuracy = caption(found.objective, prospect.metric(found.objective))
+        if prospect.evidence.accuracy == "extrapolated":
+            accuracy += " (extrapolated)"
+        told = f"{name_of(prospect)} · {prospect.fps:.1f} FPS ({doubt}) · {accuracy}"
+        remedy = f"timing it on your {profile.title} would tell; --allow-extrapolated takes it"
+        lines += [("prospect", told), ("", remedy)]
     return lines
 
 
@@ -166,12 +198,11 @@ def _sentence(found: Found, point: Point) -> str:
 
 
 def _no_pick(found: Found) -> str:
-    if found.nearest is None:
-        return "none: no candidate is left"
-    return (
-        f"none holds {found.target_fps:g} FPS on evidence better than extrapolation; "
-        f"the fastest is {_sentence(found, found.nearest)}"
-    )
+    """Why there is none; the error that the command ends with says the same in one line."""
+    rule = f"none holds {found.target_fps:g} FPS on evidence better than extrapolation"
+    if found.prospect is not None or found.nearest is None:
+        return rule
+    return f"{rule}; the fastest is {_sentence(found, found.nearest)}"
 
 
 def _left_out(found: Found) -> list[tuple[str, str]]:

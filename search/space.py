@@ -74,7 +74,7 @@ class Space:
         """Where `arch` stands in its block; None outside the space."""
         values = (BRANCHES.index(arch.branches), arch.c, arch.d_max, *arch.conv3d)
         axes = self.axes(arch.stages)
-        inside = arch.family == "rts2net" and arch.classes == CLASSES
+        inside = arch.family == "rts2net" and arch.classes == CLASSES and arch.stages in self.stages
         if not inside or any(v not in axis for v, axis in zip(values, axes, strict=True)):
             return None
         return tuple(axis.index(value) for value, axis in zip(values, axes, strict=True))
@@ -97,13 +97,15 @@ class Space:
     def nearest(self, stages: int, box: Box) -> tuple[NDArray[np.int64], ...]:
         """For each axis of a block, the positions of its values moved into `box`."""
         return tuple(
-            np.array([_closest(values, min(max(value, low), high)) for value in values])
+            np.array([_closest(values, value, low, high) for value in values])
             for values, (low, high) in zip(self.axes(stages), _ranges(box), strict=True)
         )
 
 
-def _closest(values: tuple[int, ...], target: int) -> int:
-    return int(np.argmin([abs(value - target) for value in values]))
+def _closest(values: tuple[int, ...], target: int, low: int, high: int) -> int:
+    """The position of the value nearest to `target` in low … high, or nearest to that range."""
+    away = [(max(low - value, value - high, 0), abs(value - target)) for value in values]
+    return away.index(min(away))
 
 
 def _ranges(box: Box) -> tuple[tuple[int, int], ...]:
@@ -145,7 +147,7 @@ class Parts:
         total[full] += value["first_refinement"][None]
         total = total[..., None] + value["first_regularization"]
         for stage in range(1, stages):
-            total = total[..., None] + value["regularization"][stage - 1]
+            total = total[..., None] + value[f"regularization.{stage}"]
         return total
 
     def _split(self, per_list: Floats) -> dict[str, Floats]:
@@ -207,17 +209,12 @@ def _tables(space: Space, size: Size) -> Iterator[tuple[str, _Table]]:
             (regularization(w, 0, d_max, size) for d_max in d_maxs for w in space.conv3d[0]),
         ),
     )
-    yield (
-        "regularization",
-        table(
-            (2, len(space.conv3d[1])),
-            (
-                regularization(width, stage, planes, size)
-                for stage in later
-                for width in space.conv3d[stage]
-            ),
-        ),
-    )
+    for stage in later:
+        widths = space.conv3d[stage]
+        yield (
+            f"regularization.{stage}",
+            table((len(widths),), (regularization(w, stage, planes, size) for w in widths)),
+        )
     yield (
         "head",
         table(
