@@ -31,20 +31,22 @@ def fit(points: Sequence[Point], form: LatencyModel) -> LatencyModel:
 
 def recalibrated(profile: Profile) -> Profile:
     """`profile` with every calibration fitted again to the profile's own points."""
-    return profile.model_copy(
-        update={
-            "calibrations": tuple(
-                calibrated(profile, known.model, known) for known in profile.calibrations
-            )
-        }
+    fitted = tuple(
+        calibrated(profile.points_of(known.runtime, known.precision), known.model, known.source)
+        for known in profile.calibrations
     )
+    return profile.model_copy(update={"calibrations": fitted})
 
 
-def calibrated(profile: Profile, form: LatencyModel, known: Calibration) -> Calibration:
-    """`known` with `form` fitted to its points in `profile`, and the residuals that go with it."""
-    points = profile.points_of(known.runtime, known.precision)
-    residuals = tuple(float(residual) for residual in leave_one_out(points, form))
-    return known.model_copy(update={"model": fit(points, form), "residuals": residuals})
+def calibrated(points: Sequence[Point], form: LatencyModel, source: str) -> Calibration:
+    """`form` fitted to the points of one runtime and precision, with the residuals of each."""
+    return Calibration(
+        runtime=points[0].runtime,
+        precision=points[0].precision,
+        model=fit(points, form),
+        residuals=tuple(float(residual) for residual in leave_one_out(points, form)),
+        source=source,
+    )
 
 
 def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
@@ -134,7 +136,7 @@ FORMS: dict[str, LatencyModel] = {
         starts="steps",
         folded=("norm", "relu"),
         start_ms=0,
-        ms_per=dict.fromkeys(("gmac_2d_blocked", "gmac_3d", "gbyte", "mvoxel_warp"), 0.0),
+        ms_per=dict.fromkeys(("gmac_2d_blocked", "gmac_3d_blocked", "gbyte", "gbyte_resize"), 0.0),
     ),
 }
 """The shapes that a fit fills with coefficients."""

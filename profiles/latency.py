@@ -25,6 +25,8 @@ Milliseconds = Annotated[float, Field(ge=0, le=1e6)]
 CHANNEL_BLOCK = 16
 """Single-precision channels in one AVX-512 register: CPU kernels compute whole blocks."""
 
+IMAGE_CHANNELS = 3
+
 
 def _macs(op: Op, kind: Kind) -> float:
     return op.macs / 1e9 if op.kind == kind else 0.0
@@ -34,10 +36,17 @@ def _single(op: Op) -> float:
     return _macs(op, "conv2d") if op.inputs[0][0] == 1 else 0.0
 
 
-def _blocked(op: Op) -> float:
-    """Multiply-adds of a 2D conv whose output channels fill whole blocks."""
-    channels = op.output[1]
-    return _macs(op, "conv2d") * -(-channels // CHANNEL_BLOCK) * CHANNEL_BLOCK / channels
+def _blocked(op: Op, kind: Kind) -> float:
+    """Multiply-adds of a convolution on whole blocks of channels; an image's three stay three."""
+    inputs, outputs = op.inputs[0][1], op.output[1]
+    filled = _whole_blocks(outputs) / outputs
+    if kind == "conv2d" and inputs > IMAGE_CHANNELS:
+        filled *= _whole_blocks(inputs) / inputs
+    return _macs(op, kind) * filled
+
+
+def _whole_blocks(channels: int) -> int:
+    return -(-channels // CHANNEL_BLOCK) * CHANNEL_BLOCK
 
 
 def _warped(op: Op) -> float:
@@ -47,14 +56,16 @@ def _warped(op: Op) -> float:
 FEATURES: dict[str, Callable[[Op], float]] = {
     "gmac_2d": lambda op: _macs(op, "conv2d"),
     "gmac_2d_single": _single,
-    "gmac_2d_blocked": _blocked,
+    "gmac_2d_blocked": lambda op: _blocked(op, "conv2d"),
     "gmac_3d": lambda op: _macs(op, "conv3d"),
+    "gmac_3d_blocked": lambda op: _blocked(op, "conv3d"),
     "gbyte": lambda op: op.bytes / 1e9,
+    "gbyte_resize": lambda op: op.bytes / 1e9 if op.kind == "resize" else 0.0,
     "mvoxel_warp": _warped,
 }
 """What work is measured in: 10⁹ multiply-adds of 2D convs, of those on one image alone (the
-semantic and refinement branches), of those with channels filled up to blocks, of 3D convs; 10⁹
-bytes moved; 10⁶ voxels of residual volumes."""
+semantic and refinement branches), with channels filled up to blocks (2D: inputs and outputs, 3D:
+outputs), of 3D convs; 10⁹ bytes moved, and of those by resizing; 10⁶ voxels of residual volumes."""
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 

@@ -20,7 +20,7 @@ from ..model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, UNTRAINED, Arch
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
 from .calibrate import FORMS, calibrated
-from .profile import Calibration, Fact, Machine, Point, Profile, Resolution
+from .profile import Fact, Machine, Point, Profile, Resolution
 from .timing import Timing, measure
 
 RESOLUTIONS: tuple[Resolution, ...] = ((1242, 375), (640, 192))
@@ -184,31 +184,23 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
         )
         for sample in journal.samples
     )
-    known = Calibration(
-        runtime="onnxruntime",
-        precision="fp32",
-        model=FORMS["fused_cpu"],
-        residuals=(0.0,) * len(points),
-        source=f"least squares on ln(predicted / measured) over {len(points)} timings; {source}",
-    )
     facts = (
         Fact(name="processor", value=machine.processor, source="the operating system"),
         Fact(name="threads", value=str(machine.threads), source="rts2-profile"),
     )
     title = f"CPU ({machine.processor.split(',')[0]}, {machine.threads} threads)"
-    draft = template.model_copy(
+    told = f"least squares on ln(predicted / measured) over {len(points)} timings; {source}"
+    return template.model_copy(
         update={
             "name": name,
             "title": title,
             "hardware": facts,
-            "calibrations": (known,),
+            "calibrations": (calibrated(points, FORMS["fused_cpu"], told),),
             "derivations": (),
             "points": points,
             "machine": machine,
         }
     )
-    fitted = calibrated(draft, known.model, known)
-    return draft.model_copy(update={"calibrations": (fitted,)})
 
 
 def this_machine(threads: int) -> Machine:

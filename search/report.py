@@ -217,6 +217,9 @@ def _notes(found: Found, profile: Profile) -> list[tuple[str, str]]:
         for support in profile.precisions
         if not support.supported
     ]
+    if profile.machine is not None:
+        told = f"{profile.machine.processor}, {profile.machine.date}"
+        notes.append(f"timed on {told}; rts2-profile fit --device {profile.name} times yours")
     known = {point.resolution for point in profile.points}
     if found.resolution not in known:
         sizes = ", ".join(f"{width}×{height}" for width, height in sorted(known))

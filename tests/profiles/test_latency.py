@@ -38,9 +38,11 @@ TINY = (PAIR, SINGLE, SOLID, NORM, WARP)
 WORK = {
     "gmac_2d": (2.0, 0.5, 0, 0, 0),
     "gmac_2d_single": (0, 0.5, 0, 0, 0),
-    # 20 channels fill two blocks of 16, so 32 are computed; 32 fill theirs.
-    "gmac_2d_blocked": (2.0 * 32 / 20, 0.5, 0, 0, 0),
+    # 20 outputs fill two blocks of 16, so 32 are computed; 32 fill theirs. An image's three inputs
+    # stay three, 8 inputs become 16; of a 3D conv outputs alone are filled, 2 become 16.
+    "gmac_2d_blocked": (2.0 * 32 / 20, 0.5 * 16 / 8, 0, 0, 0),
     "gmac_3d": (0, 0, 0.25, 0, 0),
+    "gmac_3d_blocked": (0, 0, 0.25 * 16 / 2, 0, 0),
     "gbyte": (
         4e-9 * (600 + 4000 + 540),
         4e-9 * (200 + 800),
@@ -48,6 +50,7 @@ WORK = {
         4e-9 * (4000 + 4000 + 40),
         4e-9 * (2 * 120_000 + 300_000),
     ),
+    "gbyte_resize": (0, 0, 0, 0, 0),
     "mvoxel_warp": (0, 0, 0, 0, 0.3),
 }
 """What each step of `TINY` counts in each feature, by hand."""
@@ -78,6 +81,11 @@ def test_features_by_hand(feature: str) -> None:
 def test_channels_are_filled_up_to_whole_blocks(channels: int, computed: int) -> None:
     op = Op("conv", "conv2d", ((1, 1, 1, 1),), (1, channels, 1, 1), macs=channels * 10**9)
     assert FEATURES["gmac_2d_blocked"](op) == pytest.approx(computed)
+
+
+def test_bytes_of_resizing_are_those_of_resizing_alone() -> None:
+    op = Op("up", "resize", ((1, 2, 10, 10),), (1, 2, 20, 20))
+    assert FEATURES["gbyte_resize"](op) == pytest.approx(4e-9 * (200 + 800))
 
 
 def test_the_sum_form_by_hand() -> None:
@@ -155,13 +163,18 @@ def looped_ms(form: LatencyModel, op: Op) -> float:
     """The cost of one step, written down again from the definition."""
     if op.kind in form.folded:
         return 0.0
-    gmac, blocks = op.macs / 1e9, -(-op.output[1] // 16)
+    gmac, inputs, outputs = op.macs / 1e9, op.inputs[0][1], op.output[1]
+    moved = 4e-9 * (sum(map(prod, op.inputs)) + prod(op.output) + op.weights)
+    filled = gmac * 16 * -(-outputs // 16) / outputs
+    deep = 1 if inputs <= 3 else 16 * -(-inputs // 16) / inputs
     counted = {
         "gmac_2d": gmac if op.kind == "conv2d" else 0,
         "gmac_2d_single": gmac if op.kind == "conv2d" and op.inputs[0][0] == 1 else 0,
-        "gmac_2d_blocked": gmac * blocks * 16 / op.output[1] if op.kind == "conv2d" else 0,
+        "gmac_2d_blocked": filled * deep if op.kind == "conv2d" else 0,
         "gmac_3d": gmac if op.kind == "conv3d" else 0,
-        "gbyte": 4e-9 * (sum(map(prod, op.inputs)) + prod(op.output) + op.weights),
+        "gmac_3d_blocked": filled if op.kind == "conv3d" else 0,
+        "gbyte": moved,
+        "gbyte_resize": moved if op.kind == "resize" else 0,
         "mvoxel_warp": prod(op.output) / 1e6 if op.kind == "warp_volume" else 0,
     }
     start = form.start_ms * (op.launches if form.starts == "kernels" else 1)

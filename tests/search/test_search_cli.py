@@ -261,7 +261,7 @@ def test_help_shows_an_example_and_the_devices(capsys: pytest.CaptureFixture[str
 
 
 WRONG_USE: dict[str, tuple[tuple[str, ...], str]] = {
-    "unknown device": (("--device", "tx1", "--target-fps", "10"), "known are rtx2080ti, tx2"),
+    "unknown device": (("--device", "tx1", "--target-fps", "10"), "known are cpu, rtx2080ti, tx2"),
     "no device": (("--target-fps", "10"), "--device"),
     "missing profile": (("--device", "nowhere.json", "--target-fps", "10"), "nowhere.json"),
     "no target": (("--device", "tx2"), "--target-fps"),
