@@ -248,7 +248,6 @@ def test_exact_timings_leave_no_residual() -> None:
 def test_a_calibration_takes_its_own_points_alone() -> None:
     """Timings of another precision in the same profile change nothing."""
     profile = load("tx2")
-    (known,) = profile.calibrations
     other = timed(SUMS[1])[0].model_copy(update={"precision": "fp16", "fps": 1.0})
     wider = profile.model_copy(update={"points": (other, *profile.points)})
     assert recalibrated(wider).calibrations == recalibrated(profile).calibrations
