@@ -151,12 +151,14 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
     if options.json:
         print_json(complete.model_dump(mode="json", by_alias=True))
         return 0
-    screen().print(
-        f"{complete.arch.label()} for {profile.title}, {complete.precision}, weights {origin}"
-    )
+    what = f"{complete.arch.label()} for {profile.title}, {complete.precision}, weights {origin}"
     names = "  ".join([file.name for file in complete.files] + ["deployment.json"])
-    screen().print(f"written   {options.out}/  {names}", soft_wrap=True)
-    screen().print(f"next      on the device: {next_step(profile)}")
+    for line in (
+        what,
+        f"written   {options.out}/  {names}",
+        f"next      on the device: {next_step(profile)}",
+    ):
+        screen().print(line, soft_wrap=True, markup=False)
     return 0
 
 
@@ -230,8 +232,8 @@ def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Net
 def _infeasible(found: Found, profile: Profile) -> str:
     """Why there is no pick, in one line, and what to do."""
     asked = f"no candidate holds {found.target_fps:g} FPS on {profile.title}"
-    asked += " on evidence better than extrapolation"
     if found.prospect is not None:
+        asked += " on evidence better than extrapolation"
         point = found.prospect
         return (
             f"{asked}; the prospect has {point.fps:.1f} FPS: {point.arch.label()} "

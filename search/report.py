@@ -199,9 +199,11 @@ def _sentence(found: Found, point: Point) -> str:
 
 def _no_pick(found: Found) -> str:
     """Why there is none; the error that the command ends with says the same in one line."""
-    rule = f"none holds {found.target_fps:g} FPS on evidence better than extrapolation"
-    if found.prospect is not None or found.nearest is None:
-        return rule
+    rule = f"none holds {found.target_fps:g} FPS"
+    if found.prospect is not None:
+        return f"{rule} on evidence better than extrapolation"
+    if found.nearest is None:
+        return f"{rule}; no candidate is left"
     return f"{rule}; the fastest is {_sentence(found, found.nearest)}"
 
 
