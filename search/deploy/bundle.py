@@ -36,8 +36,8 @@ TOLERANCE_PX = 1e-3
 class Target:
     """How a runtime gets from the graph to something that runs."""
 
-    check: str
-    """The check script, among the files beside this one."""
+    measured: str
+    """The script that runs the sample there, among the files beside this one."""
     tolerance_px: float
     """What the runtime may differ from the sample's expected disparity, on average."""
     build: Callable[[Deployment], str] | None = None
@@ -63,8 +63,8 @@ python3 check.py
 
 
 TARGETS: dict[str, Target] = {
-    "onnxruntime": Target("check_onnxruntime.py", tolerance_px=1e-2),
-    "tensorrt": Target("check_tensorrt.py", tolerance_px=0.1, build=trtexec),
+    "onnxruntime": Target("measured_onnxruntime.py", tolerance_px=1e-2),
+    "tensorrt": Target("measured_tensorrt.py", tolerance_px=0.1, build=trtexec),
 }
 """How a bundle runs, by runtime. Half precision is what TensorRT's tolerance allows for."""
 
@@ -102,7 +102,7 @@ def write(
         path = folder / f"sample_{name}.bin"
         write_bytes(path, np.ascontiguousarray(values, dtype="<f4").tobytes())
         written.append(path)
-    scripts = {"check.py": _text(target.check)}
+    scripts = {"check.py": _text("check.py"), "measured.py": _text(target.measured)}
     if target.build is not None:
         scripts["build.sh"] = target.build(deployment)
     deployment = deployment.model_copy(update={"weights": origin})
