@@ -136,9 +136,5 @@ def arch_from(values: dict[str, Any]) -> Arch:
         raise UsageError(f"arch: {first_fault(error)}") from error
 
 
-PRESETS = {f"c{c}": Arch(c=c) for c in (1, 4, 8, 16, 32)}
-"""The paper's own networks (table II), full variant with three stages."""
-
-
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -49,6 +49,9 @@ FOREGROUND = {
 }
 """What D1-fg and D1-bg rest on, in words."""
 
+SMALLEST_PX = 32
+"""Below this an image has no feature at 1/32."""
+
 Scores = dict[int | None, Score]
 
 
@@ -208,10 +211,15 @@ def _pairs(left: Path, right: Path) -> list[Pair]:
             f"{other} is not"
         )
     names = [(left, right)] if not left.is_dir() else _partners(left, right)
-    return [
-        Pair(a.stem, a, b, require_same_size({a: image_size(a), b: image_size(b)}))
-        for a, b in names
-    ]
+    return [_pair(a, b) for a, b in names]
+
+
+def _pair(left: Path, right: Path) -> Pair:
+    size = require_same_size({left: image_size(left), right: image_size(right)})
+    if min(size) < SMALLEST_PX:
+        given = "{}x{}".format(*size)
+        raise UsageError(f"images need sides of {SMALLEST_PX} pixels or more: {left} is {given}")
+    return Pair(left.stem, left, right, size)
 
 
 def _partners(left: Path, right: Path) -> list[tuple[Path, Path]]:
@@ -335,10 +343,10 @@ def _show_pairs(
             " ".join(name.removeprefix(f"{result['name']}_") for name in result["files"]),
         )
     console = screen()
-    console.print(_title(model, predictor), markup=False)
+    console.print(_title(model, predictor))
     console.print(table)
-    console.print("network ms: one run each, the first of each size after a warm-up", markup=False)
-    console.print(f"written   {folder}/  NAME_…", markup=False)
+    console.print("network ms: one run each, the first of each size after a warm-up")
+    console.print(f"written   {folder}/  NAME_…")
 
 
 def _show_scores(scores: dict[str, Scores], total: Scores, title: str) -> None:
@@ -351,7 +359,7 @@ def _show_scores(scores: dict[str, Scores], total: Scores, title: str) -> None:
             table.add_row(name, _figure(stage, 0), *(_figure(figure, 2) for figure in figures))
         table.add_section()
     console = screen()
-    console.print(title, markup=False)
+    console.print(title)
     console.print(table)
     missing = max(score.missing for score in total.values())
     if missing:

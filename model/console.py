@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import logging
 import os
@@ -34,7 +35,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parser(prog: str, description: str, example: str) -> Parser:
-    """A parser with the options that every command has."""
+    """A parser whose help ends with an example."""
     return Parser(
         prog=prog,
         description=description,
@@ -58,21 +59,52 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Command:
     def guarded(arguments: Sequence[str] | None = None) -> int:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
         try:
-            return run(arguments)
+            _open_stdout()
+            code = _ended(run, arguments)
+            sys.stdout.flush()
         except Rts2Error as error:
-            print(f"{Path(sys.argv[0]).name}: {one_line(error)}", file=sys.stderr)
-            return error.exit_code
+            return _failed(error, error.exit_code)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             return 130
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _silence_stdout()
             return 0
+        except OSError as error:
+            _silence_stdout()
+            return _failed(f"cannot write the result: {error.strerror or error}", 1)
+        return code
 
     return guarded
 
 
-def one_line(error: BaseException) -> str:
+def _ended(run: Callable[[Sequence[str] | None], int], arguments: Sequence[str] | None) -> int:
+    """The exit code; argparse exits by itself once it has printed the help."""
+    try:
+        return run(arguments)
+    except SystemExit as done:
+        return int(done.code or 0)
+
+
+def _open_stdout() -> None:
+    """Makes stdout take any text: one that is closed is an error, one of few letters is not."""
+    if sys.stdout is None:
+        raise UsageError("stdout is closed; redirect it to a file or to /dev/null")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
+def _silence_stdout() -> None:
+    """What is still buffered goes nowhere, or the interpreter would complain at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _failed(error: BaseException | str, code: int) -> int:
+    print(f"{Path(sys.argv[0]).name}: {one_line(error)}", file=sys.stderr)
+    return code
+
+
+def one_line(error: BaseException | str) -> str:
     """An error's text without line breaks."""
     return " ".join(str(error).split())
 
@@ -93,25 +125,36 @@ def progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
 
 
 def screen() -> Console:
-    """Where tables go: stdout, wide enough for a table where it is no terminal."""
+    """Where tables go: stdout, wide enough for a table where it is no terminal.
+
+    Text is text: a bracket in a file's name or a profile's title is no markup.
+    """
     from rich.console import Console
 
     class Screen(Console):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # the reader has seen enough, which is no failure
 
-    return Screen(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+    return Screen(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDTH)
 
 
 def positive(text: str) -> float:
-    """A finite number above zero, as an option type."""
+    """A number from a millionth to a million, as an option type."""
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a finite number above 0, not {text!r}")
+    if not 1e-6 <= value <= 1e6:
+        rule = "must be from 1e-6 to 1e6, a finite number above 0"
+        raise argparse.ArgumentTypeError(f"{rule}, not {text!r}")
     return value
+
+
+def seed(text: str) -> int:
+    """A whole number of 32 bits, as an option type."""
+    if not (text.isascii() and text.isdigit() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2³²−1, not {text!r}")
+    return int(text)
 
 
 def resolution(text: str) -> tuple[int, int]:

@@ -23,8 +23,11 @@ Schema = TypeVar("Schema", bound=BaseModel)
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`; it becomes `path` only if the block succeeds.
 
-    The temporary keeps `path`'s suffix, because many writers choose their format by it.
+    The temporary keeps `path`'s suffix, because many writers choose their format by it. A link is
+    followed; a device or a pipe is refused.
     """
+    path = path.resolve()
+    _refuse_special(path)
     try:
         with NamedTemporaryFile(
             dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix, delete=False
@@ -73,27 +76,35 @@ def output_folder(path: Path) -> Path:
         raise _unwritable(path, error) from error
 
 
-@contextmanager
-def replacing_folder(path: Path, marker: str) -> Iterator[Path]:
-    """Yields an empty folder beside `path`; it becomes `path` only if the block succeeds.
+def output_file(path: Path) -> Path:
+    """`path`, known to be a place where a file can be written."""
+    _refuse_special(path)
+    output_folder(path.parent)
+    return path
 
-    What stands at `path` is replaced if it is empty or holds a file named `marker`, which tells
-    an earlier result; anything else is the user's and stays.
+
+@contextmanager
+def filling_folder(path: Path, last: str) -> Iterator[Path]:
+    """Yields an empty folder; what the block leaves there moves into `path` if it succeeds.
+
+    Other files stay, as they may be the user's; files of the same names are replaced where a file
+    named `last` tells an earlier result. It comes last: while it is the old one, the folder is
+    not yet the new one.
     """
-    occupied = path.is_dir() and any(path.iterdir()) and not (path / marker).is_file()
-    if occupied or (path.exists() and not path.is_dir()):
-        raise Rts2Error(f"cannot write {path}: something else stands there; choose another --out")
+    output_folder(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        temporary = Path(mkdtemp(dir=path, prefix=".new."))
     except OSError as error:
         raise _unwritable(path, error) from error
     try:
         yield temporary
-        temporary.chmod(0o777 & ~_umask())
-        if path.exists():
-            rmtree(path)
-        temporary.replace(path)
+        filled = sorted(temporary.iterdir(), key=lambda file: (file.name == last, file.name))
+        for file in filled:
+            _refuse_special(path / file.name)
+            if (path / file.name).exists() and not (path / last).exists():
+                raise Rts2Error(f"{path / file.name} stands there already; choose another --out")
+        for file in filled:
+            file.replace(path / file.name)
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
@@ -111,7 +122,7 @@ def existing_file(path: Path, what: str) -> Path:
 def read_json(path: Path, schema: type[Schema], what: str) -> Schema:
     """The JSON file at `path`, validated as `schema`. Errors name the first wrong field."""
     try:
-        text = existing_file(path, what).read_text(encoding="utf-8")
+        text = existing_file(path, what).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise Rts2Error(f"{what} cannot be read: {path}: {error}") from error
     return parse_json(text, schema, f"{what} {path}")
@@ -139,6 +150,12 @@ def first_fault(error: ValidationError) -> str:
 def sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _refuse_special(path: Path) -> None:
+    """A rename would put a file in the place of a device, a pipe or a folder."""
+    if path.exists() and not path.is_file():
+        raise Rts2Error(f"cannot write {path}: it is no regular file; choose another --out")
 
 
 def _umask() -> int:

@@ -104,8 +104,11 @@ def _units(form: LatencyModel) -> list[LatencyModel]:
 
 
 def summary(residuals: Sequence[float]) -> dict[str, float]:
-    """Mean and worst absolute relative error, and the shares within 5% and 10%, as fractions."""
-    errors = np.abs(np.exp(-np.asarray(residuals)) - 1)
+    """Mean and worst relative error of the frame rate, and the shares within 5% and 10%.
+
+    All are fractions; a residual is ln(true / predicted latency).
+    """
+    errors = np.abs(np.exp(np.asarray(residuals)) - 1)
     return {
         "mape": float(errors.mean()),
         "max_ape": float(errors.max()),

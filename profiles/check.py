@@ -74,7 +74,8 @@ def report(profile: Profile, comparisons: Sequence[Comparison]) -> dict[str, Any
 
     true = [comparison.fps_true for comparison in comparisons]
     predicted = [comparison.fps_predicted for comparison in comparisons]
-    rank = float(spearmanr(true, predicted).statistic) if len(true) > 1 else None
+    ranked = len(set(true)) > 1 and len(set(predicted)) > 1
+    rank = float(spearmanr(true, predicted).statistic) if ranked else None
     return {
         "schema": "rts2.profile-check/1",
         "device": profile.name,

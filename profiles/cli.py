@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -17,9 +18,10 @@ from ..model.console import (
     print_json,
     progress,
     screen,
+    seed,
 )
 from ..model.errors import Rts2Error, UsageError
-from ..model.files import output_folder, write_json
+from ..model.files import output_file, write_json
 from .conformal import half_width
 from .profile import Profile, load, names
 
@@ -60,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "time N random networks on this machine instead of leaving out the profile's points"
     checked.add_argument("--samples", type=_count, metavar="N", help=text)
     _add_timing(checked)
+    _add_seed(checked)
     add_output(checked, out=None)
 
     fitted = actions.add_parser("fit", help="time networks on this machine and fit its profile")
@@ -69,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     fitted.add_argument("--budget", type=positive, default=300.0, metavar="SECONDS", help=text)
     fitted.add_argument("--out", type=Path, required=True, metavar="FILE", help="the new profile")
     _add_timing(fitted)
+    _add_seed(fitted)
     add_output(fitted, out=None)
 
     measured = actions.add_parser("measure", help="time ONNX files on this machine")
@@ -81,8 +85,11 @@ def _parser() -> argparse.ArgumentParser:
 def _add_timing(action: argparse.ArgumentParser) -> None:
     text = "threads to run on (default: every core)"
     action.add_argument("--threads", type=_count, metavar="N", help=text)
+
+
+def _add_seed(action: argparse.ArgumentParser) -> None:
     text = "which random networks are drawn (default: 0)"
-    action.add_argument("--seed", type=int, default=0, help=text)
+    action.add_argument("--seed", type=seed, default=0, help=text)
 
 
 def _count(text: str) -> int:
@@ -121,7 +128,7 @@ def _show(options: argparse.Namespace) -> None:
     if options.json:
         print_json(known.model_dump(mode="json", by_alias=True))
         return
-    _print(f"[bold]{known.title}[/bold] ({known.name})\n")
+    _print(f"{known.title} ({known.name})\n")
     facts = _table("", "value", "source")
     for fact in known.hardware:
         facts.add_row(fact.name, fact.value, fact.source)
@@ -174,7 +181,9 @@ def _check(options: argparse.Namespace) -> None:
     if options.json:
         print_json(result)
         return
-    table = _table("network", "resolution", "precision", "runtime", "FPS", "predicted", "error")
+    table = _table(
+        "network", "resolution", "precision", "runtime", "FPS", "predicted", "latency error"
+    )
     for comparison in comparisons:
         error = comparison.fps_predicted / comparison.fps_true - 1
         width, height = comparison.resolution
@@ -217,15 +226,14 @@ def _bench(options: argparse.Namespace, known: Profile) -> Bench:
 def _warn(text: str) -> None:
     from rich.console import Console
 
-    Console(stderr=True).print(f"note: {text}", highlight=False)
+    Console(stderr=True, markup=False).print(f"note: {text}", highlight=False, soft_wrap=True)
 
 
 def _fit(options: argparse.Namespace) -> None:
     from .calibrate import recalibrated, summary
 
     template = load(options.device)
-    path: Path = options.out
-    output_folder(path.parent)
+    path = output_file(options.out)
     if template.machine is None:
         fitted = recalibrated(template)
     else:
@@ -262,7 +270,8 @@ def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Pro
             f"{len(journal.samples)} networks were timed and a fit needs {needed}; "
             "the same command with a longer --budget goes on from here"
         )
-    return profile_of(journal, template, path.stem.lower())
+    name = re.sub("[^a-z0-9._-]+", "-", path.stem.lower()).strip("._-")
+    return profile_of(journal, template, name or template.name)
 
 
 def _until(deadline: float, items: Any, journal: Journal) -> Any:

@@ -65,7 +65,7 @@ class Point(Frozen):
     runtime: Runtime
     precision: Precision
     resolution: Resolution
-    fps: Annotated[float, Field(gt=0, lt=1e6)]
+    fps: Annotated[float, Field(ge=1e-3, le=1e6)]
     evidence: Literal["published", "measured"]
     source: str
 

@@ -17,12 +17,13 @@ from ..model.console import (
     print_json,
     resolution,
     screen,
+    seed,
 )
 from ..model.errors import NothingFeasible, UsageError
-from ..model.files import output_folder, remove, replacing_folder, write_bytes, write_json
+from ..model.files import filling_folder, output_folder, remove, write_bytes, write_json
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import source
-from .deploy.bundle import next_step, runtime_of, write
+from .deploy.bundle import clear_stale, next_step, runtime_of, write
 from .deploy.configuration import Deployment, of_arch, of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
@@ -146,8 +147,9 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
     if asked is None:
         size = options.resolution or KITTI
         asked = of_arch(network.arch, profile, "fp32", runtime_of(profile).runtime, size)
-    with replacing_folder(options.out, "deployment.json") as folder:
+    with filling_folder(options.out, "deployment.json") as folder:
         complete = write(network, asked, profile, origin, folder)
+    clear_stale(options.out, complete)
     if options.json:
         print_json(complete.model_dump(mode="json", by_alias=True))
         return 0
@@ -158,7 +160,7 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
         f"written   {options.out}/  {names}",
         f"next      on the device: {next_step(profile)}",
     ):
-        screen().print(line, soft_wrap=True, markup=False)
+        screen().print(line, soft_wrap=True)
     return 0
 
 
@@ -179,7 +181,7 @@ def _deploy_parser() -> argparse.ArgumentParser:
     add("--model", type=Path, metavar="CHECKPOINT", help=text)
     text = "random weights, to try speed and integration without a trained network"
     add("--untrained", action="store_true", help=text)
-    add("--seed", type=int, default=0, help="of the random weights (default: 0)")
+    add("--seed", type=seed, default=0, help="of the random weights (default: 0)")
     text = "image size, WxH (default: the search's, else 1242x375)"
     add("--resolution", type=resolution, metavar="WxH", help=text)
     add_output(described, out="rts2-bundle")
@@ -191,6 +193,8 @@ def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
     if options.front is None:
         if options.model is None:
             raise UsageError("give --front front.json, --model CHECKPOINT, or both")
+        if options.prospect:
+            raise UsageError("--prospect is a front's; give --front front.json")
         return None
     found = read(options.front)
     if found.device != profile.name:
@@ -240,6 +244,6 @@ def _infeasible(found: Found, profile: Profile) -> str:
             "(--allow-extrapolated takes it)"
         )
     if found.nearest is None:
-        return f"{asked}; every candidate was left out, see left_out"
+        return f"{asked}; every candidate was left out, the most because {found.left_out[0].reason}"
     point = found.nearest
     return f"{asked}; the fastest has {point.fps:.1f} FPS: {point.arch.label()}"

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.arch import CONV3D, STRIDES, Arch, Precision
+from ..model.console import KITTI
 from ..model.errors import UsageError
 from ..model.ops import Size, padded
 from ..profiles.conformal import half_width
@@ -44,7 +45,7 @@ class Question:
 
     profile: Profile
     target_fps: float
-    resolution: Resolution = (1242, 375)
+    resolution: Resolution = KITTI
     task: Task = "semantic-stereo"
     objective: Metric = "d1_all"
     confidence: float = 0.9
@@ -287,8 +288,10 @@ class _Block:
 
     def _accuracy_evidence(self, exact: Evidence) -> NDArray[np.int64]:
         between = EVIDENCE.index("interpolated")
-        # Rows were taken in single precision; what is carried over to another is not a row.
-        told = EVIDENCE.index(exact) if self.executor.precision == "fp32" else between
+        # Rows were taken in single precision and, if published, at KITTI's size: what is carried
+        # over to another is not a row.
+        here = exact == "measured" or _size(self.question.resolution) == _size(KITTI)
+        told = EVIDENCE.index(exact) if here and self.executor.precision == "fp32" else between
         known = np.where(self.accuracy.exact, told, between)
         return np.where(self.accuracy.extrapolated, EXTRAPOLATED, known)
 

@@ -59,9 +59,9 @@ def headline(found: Found, title: str) -> str:
 def show(found: Found, profile: Profile, written: Sequence[str], console: Console) -> None:
     """Prints the table of the front, the pick, the prospect, and what was left out."""
     scope = f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
-    console.print(f"{headline(found, profile.title)} · {scope}\n", highlight=False, markup=False)
+    console.print(Text(f"{headline(found, profile.title)} · {scope}\n"))
     console.print(_table(found, console.width))
-    lines = [*_verdict(found, profile), *_left_out(found), *_notes(found, profile)]
+    lines = [*_verdict(found), *_left_out(found), *_notes(found, profile)]
     for label, text in [*lines, ("written", "  ".join(written))]:
         row = Table.grid(padding=(0, 2))
         row.add_column(width=9)
@@ -178,7 +178,7 @@ def _thinned(points: list[Point], found: Found) -> list[Point]:
     return [points[i] for i in sorted(near | spread)]
 
 
-def _verdict(found: Found, profile: Profile) -> list[tuple[str, str]]:
+def _verdict(found: Found) -> list[tuple[str, str]]:
     lines = [("pick", _sentence(found, found.selected) if found.selected else _no_pick(found))]
     prospect = found.prospect
     if prospect is not None and prospect != found.selected:
@@ -187,7 +187,10 @@ def _verdict(found: Found, profile: Profile) -> list[tuple[str, str]]:
         if prospect.evidence.accuracy == "extrapolated":
             accuracy += " (extrapolated)"
         told = f"{name_of(prospect)} · {prospect.fps:.1f} FPS ({doubt}) · {accuracy}"
-        remedy = f"timing it on your {profile.title} would tell; --allow-extrapolated takes it"
+        remedy = (
+            f"rts2-deploy --front front.json --prospect --untrained --device {found.device} writes "
+            "what times it there; --allow-extrapolated takes it"
+        )
         lines += [("prospect", told), ("", remedy)]
     return lines
 
@@ -209,7 +212,9 @@ def _no_pick(found: Found) -> str:
 
 def _left_out(found: Found) -> list[tuple[str, str]]:
     lines = [f"{entry.count:,} candidates: {entry.reason}" for entry in found.left_out]
-    return [("left out" if not i else "", line) for i, line in enumerate(lines)]
+    competing = found.space.size - sum(entry.count for entry in found.left_out)
+    told = [("competed", f"{competing:,} candidates, whose accuracy is known")]
+    return told + [("left out" if not i else "", line) for i, line in enumerate(lines)]
 
 
 def _notes(found: Found, profile: Profile) -> list[tuple[str, str]]:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.arch import UNTRAINED
+from ...model.arch import UNTRAINED, Precision
 from ...model.errors import Rts2Error, UsageError
-from ...model.files import write_bytes, write_json
+from ...model.files import remove, write_bytes, write_json
 from ...profiles.opset import load_opset, operators, unsupported
 from ...profiles.profile import Profile, RuntimeSupport
 from .configuration import Check, Deployment, describe
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 MODEL = "model.onnx"
+BUILT = ("model.plan", "timing.cache", "output.json", "times.json")
+"""What the scripts make on the device."""
+
 TOLERANCE_PX = 1e-3
 """What the graph may differ from PyTorch, on the sample."""
 
@@ -40,6 +43,8 @@ class Target:
     """The script that runs the sample there, among the files beside this one."""
     tolerance_px: float
     """What the runtime may differ from the sample's expected disparity, on average."""
+    precisions: tuple[Precision, ...]
+    """What it makes of a float graph."""
     build: Callable[[Deployment], str] | None = None
     """The script that builds an engine there."""
 
@@ -63,8 +68,10 @@ python3 check.py
 
 
 TARGETS: dict[str, Target] = {
-    "onnxruntime": Target("measured_onnxruntime.py", tolerance_px=1e-2),
-    "tensorrt": Target("measured_tensorrt.py", tolerance_px=0.1, build=trtexec),
+    "onnxruntime": Target("measured_onnxruntime.py", 0.01, ("fp32",)),
+    "tensorrt": Target(
+        "measured_tensorrt.py", tolerance_px=0.1, precisions=("fp32", "fp16"), build=trtexec
+    ),
 }
 """How a bundle runs, by runtime. Half precision is what TensorRT's tolerance allows for."""
 
@@ -89,11 +96,17 @@ def write(
     """Writes the bundle into an empty folder; returns its configuration with files and hashes.
 
     Raises:
+        UsageError: the bundle's runtime does not run the precision.
         Rts2Error: the graph has operators that the device's runtime does not take, or its
             output is not the network's.
     """
     support = runtime_of(profile)
     target = TARGETS[support.runtime]
+    if deployment.precision not in target.precisions:
+        raise UsageError(
+            f"a bundle for {profile.title} runs {' or '.join(target.precisions)} on "
+            f"{support.runtime}, not {deployment.precision}"
+        )
     model = folder / MODEL
     sample = _sample(deployment)
     disparity = _export(network, deployment, support, origin, model, sample)
@@ -105,7 +118,7 @@ def write(
     scripts = {"check.py": _text("check.py"), "measured.py": _text(target.measured)}
     if target.build is not None:
         scripts["build.sh"] = target.build(deployment)
-    deployment = deployment.model_copy(update={"weights": origin})
+    deployment = deployment.model_copy(update={"weights": origin, "runtime": support.runtime})
     scripts["README.md"] = _readme(deployment, profile, support)
     for name, text in scripts.items():
         write_bytes(folder / name, text.encode())
@@ -120,6 +133,14 @@ def write(
     )
     write_json(folder / "deployment.json", complete.model_dump(mode="json", by_alias=True))
     return complete
+
+
+def clear_stale(folder: Path, complete: Deployment) -> None:
+    """Removes what an earlier bundle left that is not of this one: its engine, its timings."""
+    current = {file.name for file in complete.files}
+    for name in (*BUILT, "build.sh"):
+        if name not in current:
+            remove(folder / name)
 
 
 def _sample(deployment: Deployment) -> tuple[Floats, Floats]:
@@ -198,16 +219,15 @@ def _text(name: str) -> str:
 def _readme(deployment: Deployment, profile: Profile, support: RuntimeSupport) -> str:
     """What an integrator reads first."""
     expected = deployment.expected
-    expected = deployment.expected
     promise = "No search promised a frame rate for it."
     if expected is not None:
         promise = (
             f"Expected: {expected.fps:.1f} FPS ({expected.fps_low:.1f} to "
             f"{expected.fps_high:.1f} at {expected.confidence:.0%}), {expected.evidence.latency}"
         )
-        if deployment.runtime != support.runtime:
+        if expected.runtime != support.runtime:
             promise += (
-                f" for {deployment.runtime}; what is built here runs on {support.runtime}, "
+                f" for {expected.runtime}; what is built here runs on {support.runtime}, "
                 "whose speed the check tells"
             )
         promise += "."

@@ -49,8 +49,9 @@ class Output(_Frozen):
 
 
 class Expected(_Frozen):
-    """What was promised, and on what evidence."""
+    """What was promised, of which runtime, and on what evidence."""
 
+    runtime: Runtime
     fps: float
     fps_low: float
     fps_high: float
@@ -103,6 +104,7 @@ class Deployment(_Frozen):
 def of_point(point: FrontPoint, found: Found, profile: Profile) -> Deployment:
     """The configuration of a point of a front, before any file exists."""
     expected = Expected(
+        runtime=point.runtime,
         fps=point.fps,
         fps_low=point.fps_low,
         fps_high=point.fps_high,

@@ -7,14 +7,15 @@ import statistics
 import struct
 import sys
 
-import measured
-
 FOLDER = os.path.dirname(os.path.abspath(__file__))
 
 
 def read(name):
-    with open(os.path.join(FOLDER, name), "rb") as handle:
-        return handle.read()
+    try:
+        with open(os.path.join(FOLDER, name), "rb") as handle:
+            return handle.read()
+    except FileNotFoundError:
+        sys.exit("{} is missing".format(name))
 
 
 def main():
@@ -22,6 +23,8 @@ def main():
     for entry in deployment["files"]:
         if hashlib.sha256(read(entry["name"])).hexdigest() != entry["sha256"]:
             sys.exit("{} has changed since it was written".format(entry["name"]))
+    import measured  # it is one of the files just checked
+
     runtime, found, latencies_ms = measured.sample(FOLDER, deployment)
     data = read(deployment["check"]["disparity"])
     wanted = struct.unpack("<{}f".format(len(data) // 4), data)
@@ -33,7 +36,7 @@ def main():
     print("disparity {:.2g} px off on average, {:.2g} allowed".format(error, allowed))
     print("measured  {:.1f} FPS".format(1000 / statistics.median(latencies_ms)))
     if deployment["expected"]:
-        text = "expected  {fps:.1f} FPS ({fps_low:.1f} to {fps_high:.1f})"
+        text = "expected  {fps:.1f} FPS ({fps_low:.1f} to {fps_high:.1f}) on {runtime}"
         print(text.format(**deployment["expected"]))
     if not error <= allowed:
         sys.exit("FAILED: the disparity is too far off")

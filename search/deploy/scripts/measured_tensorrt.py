@@ -11,6 +11,8 @@ def sample(folder, _):
     if "disparity" not in outputs:
         sys.exit("output.json has no disparity, only {}".format(", ".join(sorted(outputs))))
     latencies_ms = [entry["computeMs"] for entry in load(folder, "times.json")]
+    if not latencies_ms:
+        sys.exit("times.json holds no run: run build.sh again")
     return "tensorrt", outputs["disparity"], latencies_ms
 
 

@@ -1,0 +1,363 @@
+"""rts2-deploy as a person or a script meets it: what it writes, what it keeps, how it refuses."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+import pytest
+import torch
+from torch import nn
+
+from rts2.model.arch import Arch
+from rts2.model.checkpoint import build, cut, load, save
+from rts2.model.export import Deployed, parity
+from rts2.model.graph import read_header
+from rts2.profiles.profile import load as load_profile
+from rts2.search.cli import deploy, search
+from rts2.search.deploy.configuration import of_point, read
+from rts2.search.result import Coverage, Found, Point, PointEvidence
+
+SIZE = (96, 64)
+PICK = Arch(c=1, stages=2, d_max=6, conv3d=(4, 2))
+PROSPECT = Arch(c=1, stages=1, d_max=6, conv3d=(4,), semantic=False)
+WHOLE = Arch(c=1, stages=3, d_max=6, conv3d=(4, 2, 2))
+"""Both are parts of it."""
+
+
+def point(arch: Arch, **changes: Any) -> Point:
+    known = {
+        "arch": arch,
+        "precision": "fp32",
+        "runtime": "pytorch",
+        "latency_ms": 40,
+        "fps": 25,
+        "fps_low": 21.5,
+        "fps_high": 29,
+        "d1_all": 5.5,
+        "epe": None,
+        "miou": None,
+        "pacc": None,
+        "params": 1,
+        "size_bytes": 4,
+        "macs": 1,
+        "evidence": PointEvidence(latency="interpolated", accuracy="published"),
+    }
+    return Point.model_validate(known | changes)
+
+
+def found(device: str, **changes: Any) -> Found:
+    pick = point(PICK, runtime="onnxruntime" if device == "cpu" else "pytorch")
+    known = {
+        "device": device,
+        "target_fps": 20,
+        "resolution": SIZE,
+        "task": "semantic-stereo",
+        "objective": "d1_all",
+        "confidence": 0.9,
+        "space": Coverage(size=1, evaluated=1, exhaustive=True),
+        "front": (pick,),
+        "selected": pick,
+        "prospect": pick.model_copy(update={"arch": PROSPECT}),
+        "nearest": None,
+        "left_out": (),
+        "elapsed_s": 0,
+    }
+    return Found.model_validate(known | changes)
+
+
+@pytest.fixture
+def front(tmp_path: Path) -> Callable[..., Path]:
+    """A front.json of a device, with changes."""
+
+    def write(device: str, **changes: Any) -> Path:
+        path = tmp_path / f"front-{device}.json"
+        path.write_text(found(device, **changes).model_dump_json(by_alias=True))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Callable[..., Path]:
+    """A checkpoint whose norms know their inputs: no layer is dead."""
+
+    def write(arch: Arch = WHOLE, origin: str = "made up for a test") -> Path:
+        network = build(arch)
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+                module.momentum = None
+        with torch.no_grad():
+            network.train()(*torch.randn(2, 4, 3, SIZE[1], SIZE[0]))
+        path = tmp_path / "model.safetensors"
+        save(network.eval(), path, origin)
+        return path
+
+    return write
+
+
+class Run:
+    def __init__(self, code: int, out: str, err: str, folder: Path) -> None:
+        self.code, self.out, self.err, self.folder = code, out, err, folder
+
+    @property
+    def json(self) -> dict[str, Any]:
+        assert (self.code, self.err) == (0, "")
+        assert self.out.count("\n") == 1
+        value: dict[str, Any] = json.loads(self.out)
+        return value
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    def command(*arguments: object, out: Path | None = None) -> Run:
+        folder = out or tmp_path / "results" / "bundle"
+        code = deploy([*map(str, arguments), "--out", str(folder)])
+        printed = capsys.readouterr()
+        return Run(code, printed.out, printed.err, folder)
+
+    return command
+
+
+def refused(ended: Run, code: int, *said: str) -> None:
+    assert (ended.code, ended.out) == (code, "")
+    assert ended.err.count("\n") == 1
+    assert "Traceback" not in ended.err
+    for text in said:
+        assert text in ended.err
+
+
+def entries(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("device", ["tx2", "rtx2080ti", "cpu"])
+def test_the_pick_becomes_a_folder(run: Any, front: Callable[..., Path], device: str) -> None:
+    ended = run("--device", device, "--front", front(device), "--untrained")
+    assert (ended.code, ended.err) == (0, "")
+    deployment = read(ended.folder / "deployment.json")
+    assert (deployment.device, deployment.arch, deployment.weights) == (device, PICK, "untrained")
+    assert {path.name for path in ended.folder.iterdir()} == {
+        *(file.name for file in deployment.files),
+        "deployment.json",
+    }
+    for name in ("deployment.json", *(file.name for file in deployment.files)):
+        assert name in ended.out
+    assert ("sh build.sh" in ended.out) == (device != "cpu")
+    assert [path.name for path in ended.folder.parent.iterdir()] == ["bundle"]
+
+
+def test_the_json_is_the_configuration(run: Any, front: Callable[..., Path]) -> None:
+    ended = run("--device", "cpu", "--front", front("cpu"), "--untrained", "--json")
+    assert ended.json == json.loads((ended.folder / "deployment.json").read_text())
+    assert ended.json["expected"]["fps_low"] == 21.5
+    assert ended.json["expected"]["evidence"]["latency"] == "interpolated"
+
+
+def test_the_front_of_a_real_search_is_deployed(
+    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("--device", "cpu", "--target-fps", "30", "--resolution", "640x192", "--task", "stereo")
+    limit = ("--max-size-mb", "0.1", "--json")
+    assert search([*asked, *limit, "--out", str(tmp_path / "found")]) == 0
+    selected = json.loads(capsys.readouterr().out)["selected"]
+    path = tmp_path / "found" / "front.json"
+    configured = json.loads((tmp_path / "found" / "deployment.json").read_text())
+    told = run("--device", "cpu", "--front", path, "--untrained", "--json").json
+    assert told["arch"] == selected["arch"]
+    assert told["expected"]["fps"] == selected["fps"]
+    for key in ("weights", "files", "check"):
+        assert told.pop(key)
+        assert not configured.pop(key)
+    assert told == configured
+
+
+def test_the_prospect_is_deployed_on_request(run: Any, front: Callable[..., Path]) -> None:
+    asked = ("--device", "cpu", "--front", front("cpu"), "--untrained", "--json")
+    assert run(*asked, "--prospect").json["arch"] == PROSPECT.model_dump(mode="json")
+
+
+def test_the_seed_decides_random_weights(run: Any, front: Callable[..., Path]) -> None:
+    asked = ("--device", "cpu", "--front", front("cpu"), "--untrained", "--json")
+    hashes = []
+    for seed in (0, 0, 1):
+        told = run(*asked, "--seed", seed).json
+        hashes.append({file["name"]: file["sha256"] for file in told["files"]})
+    assert hashes[0] == hashes[1]
+    changed = {name for name in hashes[0] if hashes[0][name] != hashes[2][name]}
+    assert changed == {"model.onnx", "sample_disparity.bin"}
+
+
+def test_a_checkpoint_is_cut_to_the_pick_and_answers_the_same(
+    run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
+) -> None:
+    path = checkpoint()
+    ended = run("--device", "tx2", "--front", front("tx2"), "--model", path)
+    assert ended.code == 0
+    graph = ended.folder / "model.onnx"
+    assert read_header(graph).arch == PICK
+    assert read_header(graph).origin == "made up for a test"
+    assert read(ended.folder / "deployment.json").weights == "made up for a test"
+    whole, _ = load(path)
+    left, right = torch.randn(2, 1, 3, SIZE[1], SIZE[0])
+    assert parity(graph, cut(whole, PICK), left, right).disparity_px < 1e-3
+    # The whole network stopped after two stages says the same: the weights are its own.
+    with torch.inference_mode():
+        expected = Deployed(whole, stages=2).eval()(left, right)[0].numpy()
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    answer = session.run(["disparity"], {"left": left.numpy(), "right": right.numpy()})[0]
+    assert abs(answer - expected).max() < 1e-3
+    assert answer.std() > 0.01
+
+
+def test_a_checkpoint_alone_promises_nothing(run: Any, checkpoint: Callable[..., Path]) -> None:
+    asked = ("--device", "cpu", "--model", checkpoint(PROSPECT), "--resolution", "90x60")
+    told = run(*asked, "--json").json
+    assert (told["expected"], told["target_fps"]) == (None, None)
+    assert told["arch"] == PROSPECT.model_dump(mode="json")
+    assert (told["input"]["resolution"], told["input"]["shape"]) == ([90, 60], [1, 3, 64, 96])
+    assert "No search promised" in (run(*asked).folder / "README.md").read_text()
+
+
+def test_a_checkpoint_that_does_not_hold_the_pick_is_refused_with_each_difference(
+    run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
+) -> None:
+    other = Arch(c=2, stages=1, d_max=8, conv3d=(4,), semantic=False)
+    ended = run("--device", "tx2", "--front", front("tx2"), "--model", checkpoint(other))
+    refused(
+        ended,
+        2,
+        "c is 2, 1 was asked for",
+        "stages is 1, 2 was asked for",
+        "d_max is 8, 6 was asked for",
+        "it has no semantic branch",
+        "it has no refinement branch",
+    )
+    assert not ended.folder.parent.exists()
+
+
+def test_random_weights_are_deployed_only_on_request(
+    run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
+) -> None:
+    path = checkpoint(PICK, "untrained")
+    asked = ("--device", "cpu", "--front", front("cpu"))
+    for arguments in (asked, (*asked, "--model", path), ("--device", "cpu", "--model", path)):
+        ended = run(*arguments)
+        refused(ended, 2, "--untrained")
+        assert not ended.folder.parent.exists()
+    assert run(*asked, "--model", path, "--untrained", "--json").json["weights"] == "untrained"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "rts2.profile/1"}'])
+def test_a_file_that_is_no_front_is_one_line(run: Any, tmp_path: Path, text: str) -> None:
+    path = tmp_path / "front.json"
+    path.write_text(text)
+    ended = run("--device", "tx2", "--front", path, "--untrained")
+    refused(ended, 1, str(path))
+    assert not ended.folder.parent.exists()
+
+
+def test_a_front_that_does_not_fit_is_refused_and_nothing_is_written(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    tx2 = front("tx2")
+    without = front("cpu", selected=None, prospect=None)
+    cases: list[tuple[int, str, tuple[object, ...]]] = [
+        (2, "searched for tx2, not for cpu", ("--device", "cpu", "--front", tx2)),
+        (2, "searched at 96x64", ("--device", "tx2", "--front", tx2, "--resolution", "640x192")),
+        (3, "has no pick", ("--device", "cpu", "--front", without)),
+        (3, "has no prospect", ("--device", "cpu", "--front", without, "--prospect")),
+        (2, "no such file", ("--device", "cpu", "--front", tmp_path / "none.json")),
+        (2, "no such file", ("--device", "cpu", "--model", tmp_path / "none.safetensors")),
+        (2, "unknown device", ("--device", "toaster", "--front", tx2)),
+        (2, "--device", ("--front", tx2)),
+        (2, "--front front.json, --model CHECKPOINT", ("--device", "cpu")),
+        (2, "must be WxH", ("--device", "cpu", "--front", tx2, "--resolution", "96")),
+        (2, "--seed", ("--device", "tx2", "--front", tx2, "--seed", "x")),
+        (2, "--seed", ("--device", "tx2", "--front", tx2, "--seed", "9" * 30)),
+    ]
+    for code, said, arguments in cases:
+        ended = run(*arguments, "--untrained")
+        refused(ended, code, said)
+        assert not ended.folder.parent.exists()
+
+
+def test_a_broken_checkpoint_leaves_nothing(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "broken.safetensors"
+    path.write_bytes(b"\x10" * 40)
+    ended = run("--device", "cpu", "--front", front("cpu"), "--model", path)
+    refused(ended, 1, str(path))
+    assert not ended.folder.parent.exists()
+
+
+def test_a_device_without_a_runtime_of_ours_is_refused(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "box.json"
+    stored = load_profile("tx2").model_dump(mode="json", by_alias=True, exclude_none=True)
+    stored["runtimes"] = [r for r in stored["runtimes"] if r["runtime"] == "pytorch"]
+    path.write_text(json.dumps(stored))
+    ended = run("--device", path, "--front", front("tx2"), "--untrained")
+    refused(ended, 2, "no runtime that a bundle can be made for")
+    assert not ended.folder.exists() or list(ended.folder.iterdir()) == []
+
+
+def test_an_earlier_bundle_is_replaced_file_by_file(run: Any, front: Callable[..., Path]) -> None:
+    first = run("--device", "tx2", "--front", front("tx2"), "--untrained", "--seed", 1)
+    before = entries(first.folder)
+    again = run("--device", "tx2", "--front", front("tx2"), "--untrained", "--seed", 2)
+    after = entries(again.folder)
+    assert after.keys() == before.keys()
+    assert {name for name in after if after[name] != before[name]} == {
+        *("deployment.json", "model.onnx", "sample_disparity.bin"),
+    }
+
+
+def test_deploying_into_the_searchs_folder_keeps_the_front(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Both write a deployment.json; `--out` of the search given again must not cost the front."""
+    folder = tmp_path / "rts2-out"
+    folder.mkdir()
+    for name in ("front.json", "front.csv", "front.png"):
+        (folder / name).write_bytes(front("cpu").read_bytes())
+    of_pick = of_point(point(PICK), found("cpu"), load_profile("cpu"))
+    (folder / "deployment.json").write_text(of_pick.model_dump_json(by_alias=True))
+    before = entries(folder)
+    run("--device", "cpu", "--front", folder / "front.json", "--untrained", out=folder)
+    after = entries(folder)
+    for name in ("front.json", "front.csv", "front.png"):
+        assert after[name] == before[name]
+
+
+def test_a_file_that_somebody_put_into_a_bundle_is_not_lost(
+    run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
+) -> None:
+    """The trained weights beside the bundle that was made of them, say."""
+    first = run("--device", "cpu", "--front", front("cpu"), "--untrained")
+    mine = first.folder / "trained.safetensors"
+    checkpoint(PICK).rename(mine)
+    before = mine.read_bytes()
+    run("--device", "cpu", "--front", front("cpu"), "--model", mine)
+    assert mine.read_bytes() == before
+
+
+def test_a_folder_of_somebody_else_keeps_its_files(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    file = folder / "chapter.tex"
+    file.write_text("mine")
+    run("--device", "cpu", "--front", front("cpu"), "--untrained", out=folder)
+    assert file.read_text() == "mine"
+    refused(run("--device", "cpu", "--front", front("cpu"), "--untrained", out=file), 1, str(file))
+    assert file.read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["front-cpu.json", "thesis"]
