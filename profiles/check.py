@@ -28,6 +28,8 @@ class Comparison:
     resolution: Resolution
     fps_true: float
     fps_predicted: float
+    drift: float = 1.0
+    """How much slower the machine ran than when the profile was made; divided out of `fps_true`."""
 
     @property
     def residual(self) -> float:
@@ -56,15 +58,27 @@ def held_out(profile: Profile) -> list[Comparison]:
 
 
 def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[Comparison]:
-    """Random networks that no fit has seen, timed on this machine now."""
+    """Random networks that no fit has seen, timed on this machine now.
+
+    A machine drifts from day to day; what the reference network in between takes now and took
+    then is divided out.
+    """
     known = profile.calibration("onnxruntime", "fp32")
     chance = random.Random(CHECK_SEED + seed)
     for _ in range(samples):
         arch, resolution = random_candidate(chance)
         timing = bench.time(arch, resolution)
+        then = profile.machine.reference_ms if profile.machine is not None else None
+        drift = 1.0 if then is None else timing.reference_ms / then
         predicted = predict_ms(known.model, arch, resolution)
         yield Comparison(
-            arch, "fp32", "onnxruntime", resolution, 1000 / timing.median_ms, 1000 / predicted
+            arch,
+            "fp32",
+            "onnxruntime",
+            resolution,
+            drift * 1000 / timing.median_ms,
+            1000 / predicted,
+            drift,
         )
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
+from statistics import median
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -197,7 +198,10 @@ def _check(options: argparse.Namespace) -> None:
             f"{error:+.1%}",
         )
     _print(table)
-    how = "left out in turn" if options.samples is None else "timed now"
+    how = "left out in turn"
+    if options.samples is not None:
+        drift = median(comparison.drift for comparison in comparisons)
+        how = f"timed now, at {drift:.2f} × the latency of the profile's day, which is divided out"
     rank = "" if result["spearman"] is None else f", Spearman {result['spearman']:.3f}"
     _print(
         f"\n{result['n']} networks {how}: mean error {result['mape']:.1%}, "

@@ -198,7 +198,7 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
             "calibrations": (calibrated(points, FORMS["fused_cpu"], told),),
             "derivations": (),
             "points": points,
-            "machine": machine,
+            "machine": machine.model_copy(update={"reference_ms": usual}),
         }
     )
 

@@ -141,6 +141,8 @@ class Machine(Frozen):
     system: str
     versions: dict[str, str]
     date: str
+    reference_ms: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """What the reference network took then: how a later day's drift is told."""
 
 
 class Profile(Frozen):

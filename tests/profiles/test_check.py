@@ -26,17 +26,23 @@ def compared(true: float, predicted: float) -> Comparison:
 
 
 class Off(Bench):
-    """A machine that is always `factor` times as slow as the cpu profile says."""
+    """A machine that is always `factor` times as slow as the cpu profile says.
 
-    def __init__(self, factor: float) -> None:
-        self.factor = factor
+    On a day when everything, the reference too, takes `drift` times as long.
+    """
+
+    def __init__(self, factor: float, drift: float = 1.0) -> None:
+        self.factor, self.drift = factor, drift
         self.timed: list[tuple[Arch, Resolution]] = []
 
     def time(self, arch: Arch, resolution: Resolution) -> Timing:
         self.timed.append((arch, resolution))
         model = load("cpu").calibration("onnxruntime", "fp32").model
-        latency_ms = self.factor * predict_ms(model, arch, resolution)
-        return Timing(latency_ms, latency_ms, 10, 1.0)
+        latency_ms = self.drift * self.factor * predict_ms(model, arch, resolution)
+        machine = load("cpu").machine
+        assert machine is not None
+        assert machine.reference_ms is not None
+        return Timing(latency_ms, latency_ms, 10, self.drift * machine.reference_ms)
 
 
 def test_a_residual_is_of_latency() -> None:
@@ -119,6 +125,12 @@ def test_fresh_networks_are_judged_by_the_profile_that_claims_them() -> None:
     assert [c.residual for c in found] == pytest.approx([0.07] * 5)
     told = report(profile, found)
     assert (told["n"], told["within_5"], told["within_10"]) == (5, 0.0, 1.0)
+
+
+def test_what_the_reference_drifted_is_divided_out_and_told() -> None:
+    found = list(fresh(load("cpu"), Off(exp(0.07), drift=1.5), 5, seed=0))
+    assert [c.residual for c in found] == pytest.approx([0.07] * 5)
+    assert [c.drift for c in found] == pytest.approx([1.5] * 5)
 
 
 def test_fresh_networks_are_none_that_a_fit_was_made_of() -> None:

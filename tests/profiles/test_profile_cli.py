@@ -44,7 +44,9 @@ class Planted:
     def time(self, arch: Arch, resolution: Resolution) -> Timing:
         CLOCK.now += 1
         latency_ms = predict_ms(load("cpu").calibrations[0].model, arch, resolution)
-        return Timing(latency_ms, 1.1 * latency_ms, 10, 10.0)
+        machine = load("cpu").machine
+        assert machine is not None
+        return Timing(latency_ms, 1.1 * latency_ms, 10, machine.reference_ms or 10.0)
 
 
 CLOCK = Clock()
