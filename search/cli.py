@@ -23,7 +23,7 @@ from ..model.errors import NothingFeasible, UsageError
 from ..model.files import filling_folder, output_folder, remove, write_bytes, write_json
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import source
-from .deploy.bundle import clear_stale, next_step, runtime_of, write
+from .deploy.bundle import next_step, runtime_of, stale, write
 from .deploy.configuration import Deployment, of_arch, of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
@@ -147,9 +147,12 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
     if asked is None:
         size = options.resolution or KITTI
         asked = of_arch(network.arch, profile, "fp32", runtime_of(profile).runtime, size)
+    leftover = stale(options.out)
     with filling_folder(options.out, "deployment.json") as folder:
         complete = write(network, asked, profile, origin, folder)
-    clear_stale(options.out, complete)
+    for path in leftover:
+        if path.name not in {file.name for file in complete.files}:
+            remove(path)
     if options.json:
         print_json(complete.model_dump(mode="json", by_alias=True))
         return 0

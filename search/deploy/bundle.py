@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from ...model.arch import UNTRAINED, Precision
 from ...model.errors import Rts2Error, UsageError
-from ...model.files import remove, write_bytes, write_json
+from ...model.files import write_bytes, write_json
 from ...profiles.opset import load_opset, operators, unsupported
 from ...profiles.profile import Profile, RuntimeSupport
-from .configuration import Check, Deployment, describe
+from .configuration import Check, Deployment, describe, read
 
 if TYPE_CHECKING:
     from ...model.checkpoint import Network
@@ -135,12 +135,12 @@ def write(
     return complete
 
 
-def clear_stale(folder: Path, complete: Deployment) -> None:
-    """Removes what an earlier bundle left that is not of this one: its engine, its timings."""
-    current = {file.name for file in complete.files}
-    for name in (*BUILT, "build.sh"):
-        if name not in current:
-            remove(folder / name)
+def stale(folder: Path) -> tuple[Path, ...]:
+    """The files of an earlier bundle in `folder`, and what its scripts made; none without one."""
+    path = folder / "deployment.json"
+    files = read(path).files if path.is_file() else ()
+    names = (*(file.name for file in files), *BUILT) if files else ()
+    return tuple(folder / name for name in names if Path(name).name == name)
 
 
 def _sample(deployment: Deployment) -> tuple[Floats, Floats]:

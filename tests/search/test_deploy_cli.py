@@ -361,3 +361,20 @@ def test_a_folder_of_somebody_else_keeps_its_files(
     refused(run("--device", "cpu", "--front", front("cpu"), "--untrained", out=file), 1, str(file))
     assert file.read_text() == "mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["front-cpu.json", "thesis"]
+
+
+def test_only_what_an_earlier_bundle_left_is_cleared(
+    run: Any, front: Callable[..., Path], tmp_path: Path
+) -> None:
+    """A TX2's engine and its build script go with its bundle; the user's own files stay."""
+    folder = tmp_path / "bundle"
+    folder.mkdir()
+    (folder / "output.json").write_text("mine")
+    run("--device", "tx2", "--front", front("tx2"), "--untrained", out=folder)
+    assert (folder / "output.json").read_text() == "mine"
+    (folder / "model.plan").write_text("an engine")
+    (folder / "notes.txt").write_text("mine")
+    run("--device", "cpu", "--front", front("cpu"), "--untrained", out=folder)
+    left = {path.name for path in folder.iterdir()}
+    assert "notes.txt" in left
+    assert not left & {"model.plan", "build.sh", "output.json"}
