@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .cloud import Calibration, cloud, read_calibration, write_cloud
-from .console import add_output, command, parser, positive, print_json, progress, resolution, screen
+from .console import (
+    add_output,
+    command,
+    figure,
+    parser,
+    positive,
+    print_json,
+    progress,
+    resolution,
+    screen,
+)
 from .data.images import (
     LARGEST_PX,
     image_size,
@@ -338,8 +348,8 @@ def _show_pairs(
         table.add_row(
             result["name"],
             "{}x{}".format(*result["size"]),
-            f"{_figure(low, 1)} – {_figure(high, 1)}",
-            _figure(result["network_ms"], 0),
+            f"{figure(low, 1)} – {figure(high, 1)}",
+            figure(result["network_ms"], 0),
             " ".join(name.removeprefix(f"{result['name']}_") for name in result["files"]),
         )
     console = screen()
@@ -356,7 +366,7 @@ def _show_scores(scores: dict[str, Scores], total: Scores, title: str) -> None:
     for name, stages in rows:
         for stage, score in stages.items():
             figures = (score.d1_all, score.d1_bg, score.d1_fg, score.epe, score.miou, score.pacc)
-            table.add_row(name, _figure(stage, 0), *(_figure(figure, 2) for figure in figures))
+            table.add_row(name, figure(stage, 0), *(figure(value, 2) for value in figures))
         table.add_section()
     console = screen()
     console.print(title)
@@ -381,7 +391,3 @@ def _title(model: Path, predictor: Predictor) -> str:
     label = "an ONNX graph" if predictor.arch is None else predictor.arch.label()
     named = f"{model.name} · {label}"
     return named if predictor.origin is None else f"{named} · {predictor.origin}"
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"

@@ -114,6 +114,11 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, allow_nan=False))
 
 
+def figure(value: float | None, digits: int) -> str:
+    """A number of a table; a dash where nobody knows."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
 def progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
     """`items`, with a progress bar on stderr where stderr is a terminal."""
     from rich.console import Console

@@ -13,6 +13,7 @@ from ..model.console import (
     KITTI,
     add_output,
     command,
+    figure,
     parser,
     print_json,
     progress,
@@ -176,9 +177,5 @@ def _show(report: Report, out: Path) -> None:
 
 def _row(metrics: Metrics) -> list[str]:
     figures = ((metrics.d1_all, 2), (metrics.epe, 3), (metrics.miou, 2))
-    texts = [_figure(value, digits) for value, digits in figures]
-    return [*texts, _figure(metrics.size_bytes / 1000, 0), _figure(metrics.sqnr_db, 1)]
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+    texts = [figure(value, digits) for value, digits in figures]
+    return [*texts, figure(metrics.size_bytes / 1000, 0), figure(metrics.sqnr_db, 1)]
