@@ -27,13 +27,13 @@ from .data.images import (
     LARGEST_PX,
     image_size,
     read_rgb,
-    require_crop_fits,
     require_same_size,
     write_disparity,
     write_image,
     write_indexed,
 )
-from .data.kitti import Sample, samples
+from .data.kitti import samples
+from .data.scene import Sample, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
 from .metrics import Score
@@ -108,7 +108,7 @@ def evaluate(arguments: Sequence[str] | None = None) -> int:
     options = _evaluate_parser().parse_args(arguments)
     frames = DATASETS[options.dataset](options.data)
     for frame in frames if options.crop else ():
-        require_crop_fits(options.crop, image_size(frame.left), frame.name)
+        require_crop_fits(options.crop, frame.size, frame.name)
     predictor = _open(options.model)
     scores = {
         frame.name: evaluate_frame(predictor, frame, options.stages, options.crop)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arch import MEAN, STD, Arch
-from .data.images import Bytes, Disparity, Scene
+from .data.images import Bytes, Disparity
+from .data.scene import Scene
 from .errors import Rts2Error, UsageError
 from .files import existing_file, parse_json
 from .graph import HEADER, GraphHeader

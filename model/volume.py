@@ -33,7 +33,7 @@ def residual_volume(left: Tensor, right: Tensor, disparity: Tensor) -> Tensor:
     its disparity, so six gathers along x serve the five of them. Source: paper, section III-C.
     """
     channels, width = left.shape[1], left.shape[-1]
-    x = torch.arange(width, dtype=left.dtype, device=left.device) - disparity
+    x = torch.arange(width, dtype=disparity.dtype, device=left.device) - disparity
     whole = x.floor()
     fraction = x - whole
     padded = F.pad(right, (1, 1))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.data.images import Scene
+from ..model.data.scene import Scene
 from ..model.errors import Rts2Error
 from ..model.metrics import Score
 from ..model.predictor import Estimate, Predictor, judge

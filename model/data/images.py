@@ -1,4 +1,4 @@
-"""Stereo images and disparity maps: their files, and the scene that a data set yields.
+"""Stereo images and disparity maps as files.
 
 In memory a disparity map is float32 in pixels, and NaN where nothing is known: a forgotten mask
 then shows, where a zero would pass for an answer.
@@ -11,9 +11,7 @@ import struct
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,71 +22,12 @@ from ..files import existing_file, write_bytes
 
 Bytes = NDArray[np.uint8]
 Disparity = NDArray[np.float32]
-Number = TypeVar("Number", bound=np.generic)
 
 STEPS = 256
 """KITTI's 16-bit PNG holds disparities in steps of 1/256 pixel; 0 stands for none."""
 
 LARGEST_PX = 65535 / STEPS
 """The largest disparity that such a file holds; larger ones are written as this."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One rectified pair with what is known of it; every array has the same H and W."""
-
-    name: str
-    left: Bytes
-    """(H, W, 3), RGB; so is `right`."""
-    right: Bytes
-    truth: Disparity
-    foreground: NDArray[np.bool_] | None = None
-    semantic: Bytes | None = None
-    """(H, W), train ids; 255 is unlabelled."""
-
-    def __post_init__(self) -> None:
-        sizes = {name: _size(array) for name, array in self._arrays().items()}
-        if len(set(sizes.values())) > 1:
-            listed = ", ".join(
-                f"{name} {width}x{height}" for name, (width, height) in sizes.items()
-            )
-            raise Rts2Error(f"{self.name}: all images of a scene must have one size: {listed}")
-
-    def bottom_right(self, width: int, height: int) -> Scene:
-        """The bottom-right corner of every image, the crop that AnyNet's protocol uses."""
-        whole = _size(self.left)
-        require_crop_fits((width, height), whole, self.name)
-
-        def cut(array: NDArray[Number]) -> NDArray[Number]:
-            return array[-height:, -width:]
-
-        return Scene(
-            self.name,
-            cut(self.left),
-            cut(self.right),
-            cut(self.truth),
-            None if self.foreground is None else cut(self.foreground),
-            None if self.semantic is None else cut(self.semantic),
-        )
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        named: dict[str, NDArray[Any] | None] = {
-            "left": self.left,
-            "right": self.right,
-            "truth": self.truth,
-            "foreground": self.foreground,
-            "semantic": self.semantic,
-        }
-        return {name: array for name, array in named.items() if array is not None}
-
-
-def require_crop_fits(crop: tuple[int, int], size: tuple[int, int], name: str) -> None:
-    """Raises `UsageError` where a crop (width, height) is larger than the image."""
-    if crop[0] > size[0] or crop[1] > size[1]:
-        raise UsageError(
-            f"the crop must lie within every image: {crop[0]}x{crop[1]} does not fit in "
-            f"{name} of {size[0]}x{size[1]}; give a smaller --crop"
-        )
 
 
 def require_same_size(sizes: Mapping[Path, tuple[int, int]]) -> tuple[int, int]:
@@ -183,7 +122,3 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise Rts2Error(f"{path} is truncated or no image: {error}") from error
     except Image.DecompressionBombError as error:
         raise Rts2Error(f"{path} is too large an image: {error}") from error
-
-
-def _size(array: NDArray[Any]) -> tuple[int, int]:
-    return array.shape[1], array.shape[0]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import Rts2Error, UsageError
 from ..metrics import IGNORED
-from .images import Bytes, Scene, read_disparity, read_rgb, read_whole
+from .images import Bytes, image_size, read_disparity, read_rgb, read_whole
+from .scene import Foreground, Scene
 
 FRAME = "*_10.png"
 """The reference frames; the `_11` frames beside them serve scene flow alone."""
@@ -48,11 +48,16 @@ class Sample:
     objects: Path | None = None
 
     @property
-    def foreground(self) -> Literal["obj_map", "instance"] | None:
+    def foreground(self) -> Foreground | None:
         """What tells foreground from background: the official object map, else the instances."""
         if self.objects is not None:
             return "obj_map"
         return None if self.instance is None else "instance"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the left image."""
+        return image_size(self.left)
 
     def read(self) -> Scene:
         """The images; the truth is that of all pixels, as the server scores it."""

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper
 
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, load, save
-from rts2.model.data.images import Scene
+from rts2.model.data.scene import Scene
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.predictor import (
     Estimate,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rts2.model.data.images import Scene
+from rts2.model.data.scene import Scene
 from rts2.model.errors import Rts2Error
 from rts2.model.predictor import Estimate
 from rts2.quant.parity import SHIFT_PX, measure, sqnr_db, synthetic_scene
