@@ -70,11 +70,16 @@ def read_whole(path: Path) -> NDArray[np.int32]:
 
 def read_disparity(path: Path) -> Disparity:
     """A KITTI 16-bit disparity PNG: (H, W) in pixels, NaN where the file holds 0."""
+    stored = read_steps(path)
+    return np.where(stored > 0, stored / STEPS, np.float32(np.nan)).astype(np.float32)
+
+
+def read_steps(path: Path) -> NDArray[np.float32]:
+    """A 16-bit disparity PNG as it is stored: (H, W) whole steps, 0 where nothing is known."""
     with _opened(path) as image:
         if not image.mode.startswith("I"):
             raise Rts2Error(f"{path} must be a 16-bit disparity PNG; it is {image.mode}")
-        stored = np.asarray(image).astype(np.float32)
-    return np.where(stored > 0, stored / STEPS, np.float32(np.nan)).astype(np.float32)
+        return np.asarray(image).astype(np.float32)
 
 
 def write_disparity(path: Path, disparity: Disparity) -> int:

@@ -1,141 +1,167 @@
-"""KITTI 2015 on disk: which files make a sample, and what they hold."""
+"""KITTI 2015 and 2012 on disk: which files make a frame, and what they hold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
-from ..errors import Rts2Error, UsageError
-from ..metrics import IGNORED
-from .images import Bytes, image_size, read_disparity, read_rgb, read_whole
-from .scene import Foreground, Scene
+from ..errors import UsageError
+from ..files import parse_json
+from .frame import Coding, Frame, Instances
+from .images import Bytes, read_disparity, read_whole
+from .labels import train_ids
+from .layout import chosen, column, entries, require_folder, require_folders, rows
 
-FRAME = "*_10.png"
-"""The reference frames; the `_11` frames beside them serve scene flow alone."""
+FRAME: Final = "*_10.png"
+"""The reference frames; the `_11` frames beside them serve scene flow and flow alone."""
 
-REQUIRED = {"left": "image_2", "right": "image_3", "occluded": "disp_occ_0"}
-OPTIONAL = {
-    "visible": "disp_noc_0",
-    "semantic": "semantic",
-    "instance": "instance",
-    "objects": "obj_map",
-}
-"""The folders of the official layout, by the field of `Sample` they fill."""
-
-LABEL_IDS = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
-"""The label ids of train ids 0 … 18; KITTI shares them with Cityscapes."""
-
-NUMBERED = 256
+NUMBERED: Final = 256
 """An instance map holds label id · 256 + number; number 0 is no object of its own."""
+
+TRAINING, TESTING = "training", "testing"
 
 
 @dataclass(frozen=True)
-class Sample:
-    """The files of one frame; what the data set does not have is None."""
+class Layout:
+    """The folders of one release, by the field of `Frame` that they fill."""
 
-    name: str
-    left: Path
-    right: Path
-    occluded: Path
-    """Disparity of all pixels, also of those hidden in the right image."""
-    visible: Path | None = None
-    """Disparity of the pixels that both images see."""
-    semantic: Path | None = None
-    instance: Path | None = None
-    objects: Path | None = None
-
-    @property
-    def foreground(self) -> Foreground | None:
-        """What tells foreground from background: the official object map, else the instances."""
-        if self.objects is not None:
-            return "obj_map"
-        return None if self.instance is None else "instance"
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the left image."""
-        return image_size(self.left)
-
-    def read(self) -> Scene:
-        """The images; the truth is that of all pixels, as the server scores it."""
-        return Scene(
-            name=self.name,
-            left=read_rgb(self.left),
-            right=read_rgb(self.right),
-            truth=read_disparity(self.occluded),
-            foreground=self._foreground_mask(),
-            semantic=None if self.semantic is None else train_ids(read_whole(self.semantic)),
-        )
-
-    def _foreground_mask(self) -> NDArray[np.bool_] | None:
-        if self.objects is not None:
-            return np.asarray(read_whole(self.objects) != 0)
-        if self.instance is not None:
-            return np.asarray(read_whole(self.instance) % NUMBERED != 0)
-        return None
+    title: str
+    images: tuple[dict[str, str], ...]
+    """Left and right; the first of these that is there."""
+    truth: dict[str, str]
+    """Needed in `training`."""
+    optional: dict[str, str]
+    """Taken where they are there."""
 
 
-def samples(folder: Path) -> tuple[Sample, ...]:
+KITTI_2015: Final = Layout(
+    "KITTI 2015",
+    ({"left": "image_2", "right": "image_3"},),
+    {"truth": "disp_occ_0"},
+    {
+        "visible": "disp_noc_0",
+        "semantic": "semantic",
+        "instance": "instance",
+        "objects": "obj_map",
+    },
+)
+
+KITTI_2012: Final = Layout(
+    "KITTI 2012",
+    ({"left": "colored_0", "right": "colored_1"}, {"left": "image_0", "right": "image_1"}),
+    {"truth": "disp_occ"},
+    {"visible": "disp_noc"},
+)
+
+
+class Split(BaseModel):
+    """A written split: which frames train and which judge."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: Literal["rts2.split/1"] = Field(alias="schema")
+    dataset: str
+    seed: int
+    drawn: str
+    """The expression that drew the frames."""
+    train: tuple[str, ...]
+    val: tuple[str, ...]
+
+
+def open_2015(folder: Path, split: str = "all") -> tuple[Frame, ...]:
     """The frames of KITTI 2015, by name.
 
-    `folder` is the one that holds `training`, or that one itself.
+    `folder` is the one that holds `training` and `testing`, or one of these itself. `split` is
+    `all` of training, `train` or `val` of the written split, or `test`, which has no truth.
 
     Raises:
-        UsageError: there is no such folder, or it does not hold the layout.
+        UsageError: there is no such folder, it does not hold the layout, or a frame of the split.
         Rts2Error: some frames lack a file in one of the folders.
     """
-    root = _training(folder)
-    named = {field: _frames(root / name) for field, name in REQUIRED.items()}
-    named |= {f: _frames(root / name) for f, name in OPTIONAL.items() if (root / name).is_dir()}
-    names = sorted(set().union(*named.values()))
-    if not names:
-        raise UsageError(f"KITTI 2015 needs images {FRAME} in {root / 'image_2'}; none is there")
-    _require_complete(root, named, names)
+    if split == "test":
+        return _frames(_testing(folder, KITTI_2015), KITTI_2015, with_truth=False)
+    frames = _frames(_training(folder, KITTI_2015), KITTI_2015, with_truth=True)
+    if split == "all":
+        return frames
+    names = {"train": paper_split().train, "val": paper_split().val}[split]
+    return chosen(frames, names, f"the split {split} (all takes every frame there is)", folder)
+
+
+def open_2012(folder: Path, split: str = "all") -> tuple[Frame, ...]:
+    """The frames of KITTI 2012, by name: `all` of training, or `test`. As `open_2015`."""
+    if split == "test":
+        return _frames(_testing(folder, KITTI_2012), KITTI_2012, with_truth=False)
+    return _frames(_training(folder, KITTI_2012), KITTI_2012, with_truth=True)
+
+
+def paper_split() -> Split:
+    """160 frames to train and 40 to judge, as many as in the paper, whose own are not known."""
+    file = resources.files(__package__) / "splits" / "kitti2015.json"
+    return parse_json(file.read_text("utf-8"), Split, "the split of KITTI 2015")
+
+
+def read_labels(path: Path) -> Bytes:
+    """A file of label ids as train ids."""
+    return train_ids(read_whole(path))
+
+
+def own_objects(values: Instances) -> Instances:
+    """KITTI's instance codes; 0 where the number is 0, as for a crowd far away.
+
+    The code stays whole, because numbers start anew with every class.
+    """
+    return np.where(values % NUMBERED != 0, values, 0).astype(np.int32)
+
+
+CODING: Final = Coding("kitti", read_disparity, read_labels, own_objects)
+
+
+def _frames(root: Path, layout: Layout, *, with_truth: bool) -> tuple[Frame, ...]:
+    """Every frame of one folder of the release."""
+    folders = _images(root, layout)
+    if with_truth:
+        folders = folders | layout.truth
+        folders |= {f: name for f, name in layout.optional.items() if (root / name).is_dir()}
+    columns = {field: column(root / name, FRAME) for field, name in folders.items()}
     return tuple(
-        Sample(name=name, **{field: files[name] for field, files in named.items()})
-        for name in names
+        Frame(name=f"{name}_10", coding=CODING, **files)
+        for name, files in rows(columns, layout.title)
     )
 
 
-def train_ids(label_ids: NDArray[np.int32]) -> Bytes:
-    """Label ids as train ids 0 … 18; every other label becomes `IGNORED`."""
-    if label_ids.min(initial=0) < 0 or label_ids.max(initial=0) > 255:
-        raise Rts2Error(f"label ids must be 0 to 255, found {label_ids.max()}")
-    table = np.full(256, IGNORED, np.uint8)
-    table[list(LABEL_IDS)] = np.arange(len(LABEL_IDS))
-    return table[label_ids]
+def _images(root: Path, layout: Layout) -> dict[str, str]:
+    """The folders of the images: the first choice that is there."""
+    for choice in layout.images:
+        if all((root / name).is_dir() for name in choice.values()):
+            return choice
+    return layout.images[0]
 
 
-def _training(folder: Path) -> Path:
-    """The folder in which the layout begins."""
-    if not folder.is_dir():
-        found = "it is a file" if folder.exists() else "there is no such folder"
-        raise UsageError(f"KITTI 2015 must be a folder that holds training: {folder}: {found}")
-    root = folder / "training" if (folder / "training").is_dir() else folder
-    missing = [name for name in REQUIRED.values() if not (root / name).is_dir()]
-    if missing:
-        found = ", ".join(sorted(path.name for path in root.iterdir())[:8]) or "nothing"
-        raise UsageError(
-            f"KITTI 2015 needs the folders {', '.join(REQUIRED.values())} in {root}: "
-            f"{', '.join(missing)} not there; found {found}"
-        )
+def _training(folder: Path, layout: Layout) -> Path:
+    """The folder in which the frames with truth begin."""
+    require_folder(folder, layout.title, TRAINING)
+    root = folder / TRAINING if (folder / TRAINING).is_dir() else folder
+    require_folders(root, [*_images(root, layout).values(), *layout.truth.values()], layout.title)
     return root
 
 
-def _frames(folder: Path) -> dict[str, Path]:
-    return {path.stem: path for path in folder.glob(FRAME)}
+def _testing(folder: Path, layout: Layout) -> Path:
+    """The folder in which the frames without truth begin."""
+    require_folder(folder, layout.title, TESTING)
+    root = folder / TESTING if (folder / TESTING).is_dir() else folder
+    if root is folder and _holds_training(folder, layout):
+        raise UsageError(
+            f"{layout.title} needs the folder {TESTING} for its test frames: "
+            f"it is not in {folder}; found {entries(folder)}"
+        )
+    require_folders(root, [*_images(root, layout).values()], layout.title)
+    return root
 
 
-def _require_complete(root: Path, named: dict[str, dict[str, Path]], names: list[str]) -> None:
-    """Every folder must hold every frame; the first that does not is named with both counts."""
-    for field, files in named.items():
-        lacking = [name for name in names if name not in files]
-        if lacking:
-            place = root / (REQUIRED | OPTIONAL)[field]
-            raise Rts2Error(
-                f"every frame needs its file in every folder: {place} has {len(files)} "
-                f"of {len(names)} files {FRAME}, first missing {lacking[0]}.png"
-            )
+def _holds_training(folder: Path, layout: Layout) -> bool:
+    return any((folder / name).is_dir() for name in (TRAINING, *layout.truth.values()))
