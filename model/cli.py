@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import evaluation
+from .box import DEFAULT, SHIPPED, named_model
 from .cloud import Calibration, cloud, read_calibration, write_cloud
 from .console import (
     add_output,
@@ -22,7 +24,9 @@ from .console import (
     progress,
     resolution,
     screen,
+    seed,
 )
+from .data.catalog import DATASETS, STREETS, open_dataset
 from .data.images import (
     LARGEST_PX,
     image_size,
@@ -32,12 +36,11 @@ from .data.images import (
     write_image,
     write_indexed,
 )
-from .data.kitti import samples
 from .data.scene import Sample, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
-from .metrics import Score
 from .pictures import PALETTE, coloured, overlay
+from .submission import Part, finish, new_folder, write_frame
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,13 +48,13 @@ if TYPE_CHECKING:
     from .data.images import Bytes
     from .predictor import Estimate, Predictor
 
-DATASETS: dict[str, Callable[[Path], tuple[Sample, ...]]] = {"kitti2015": samples}
-"""What rts2-eval can read, by the name that --dataset takes."""
-
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """What counts as an image in a folder."""
 
-MODEL = "a checkpoint (rts2's .safetensors, AnyNet's released .tar) or an .onnx file of rts2"
+MODEL = (
+    f"{', '.join(SHIPPED)} in the box, a checkpoint (rts2's .safetensors, AnyNet's released .tar), "
+    "or an .onnx file of rts2"
+)
 
 FOREGROUND = {
     "obj_map": "the data set's object map",
@@ -59,10 +62,34 @@ FOREGROUND = {
 }
 """What D1-fg and D1-bg rest on, in words."""
 
+OBJECT_SIZES = {
+    "published": "the data set's own evaluation",
+    "data set": "the very images judged, as the data set publishes none",
+}
+"""Whose average object sizes iIoU rests on, in words."""
+
+TITLES = {
+    "d1_all": "D1-all %",
+    "d1_bg": "D1-bg %",
+    "d1_fg": "D1-fg %",
+    "d1_noc": "D1-noc %",
+    "epe": "EPE px",
+    "miou": "mIoU %",
+    "miou_category": "mIoU cat. %",
+    "iiou": "iIoU %",
+    "iiou_category": "iIoU cat. %",
+    "pacc": "pAcc %",
+}
+"""The columns of rts2-eval's table, by figure."""
+
+SHOWN_IMAGES = 20
+"""With more images than this the table has the totals alone."""
+
+SUBMITTED = "kitti2015"
+"""The data set whose servers take a submission."""
+
 SMALLEST_PX = 32
 """Below this an image has no feature at 1/32."""
-
-Scores = dict[int | None, Score]
 
 
 @dataclass(frozen=True)
@@ -79,8 +106,6 @@ class Pair:
 def infer(arguments: Sequence[str] | None = None) -> int:
     """The command rts2-infer: disparity, semantics and points of pairs or folders of pairs."""
     options = _infer_parser().parse_args(arguments)
-    if options.model is None:
-        raise UsageError(f"--model is required: {MODEL}")
     calibration = _calibration(options)
     pairs = _pairs(options.left, options.right)
     if calibration is not None:
@@ -106,39 +131,73 @@ def infer(arguments: Sequence[str] | None = None) -> int:
 def evaluate(arguments: Sequence[str] | None = None) -> int:
     """The command rts2-eval: a network's errors on a data set, per image and per stage."""
     options = _evaluate_parser().parse_args(arguments)
-    frames = DATASETS[options.dataset](options.data)
-    for frame in frames if options.crop else ():
-        require_crop_fits(options.crop, frame.size, frame.name)
+    options.split = options.split or DATASETS[options.dataset].judged
+    samples = _samples(options)
+    folder = None if options.submission is None else _submission_folder(options)
     predictor = _open(options.model)
-    scores = {
-        frame.name: evaluate_frame(predictor, frame, options.stages, options.crop)
-        for frame in progress(frames, "images", len(frames))
+    scores = _judged(predictor, samples, options, folder)
+    parts = () if folder is None else finish(folder, {each.name: each.size for each in samples})
+    report = {
+        "schema": "rts2.eval/1",
+        **_about(options.model, predictor),
+        "dataset": options.dataset,
+        "split": options.split,
+        "crop": options.crop,
+        "foreground": samples[0].foreground,
+        **evaluation.report(scores, options.dataset),
+        "submission": None if folder is None else _submitted(folder, parts),
     }
-    total = overall(list(scores.values()))
     if options.json:
-        about = _about(options.model, predictor) | {"dataset": options.dataset}
-        about |= {"crop": options.crop, "foreground": frames[0].foreground}
-        print_json({"schema": "rts2.eval/1", **about, **_report(scores, total)})
+        print_json(report)
     else:
-        _show_scores(scores, total, f"{_title(options.model, predictor)} · {options.dataset}")
-        if frames[0].foreground is not None:
-            print(f"foreground: {FOREGROUND[frames[0].foreground]}")
+        _show_scores(report, f"{_title(options.model, predictor)} · {options.dataset}", parts)
     return 0
 
 
-def evaluate_frame(
-    predictor: Predictor, frame: Sample, stages: int | None, crop: tuple[int, int] | None
-) -> Scores:
-    """One frame's score by stage, on the bottom-right crop (width, height) if one is given."""
-    from .predictor import judge
+def _judged(
+    predictor: Predictor,
+    samples: Sequence[Sample],
+    options: argparse.Namespace,
+    folder: Path | None,
+) -> list[tuple[str, evaluation.Scores]]:
+    """Every image's name and scores; its maps go into `folder`, if there is one."""
+    scores = []
+    judged = evaluation.evaluate(predictor, samples, options.stages, options.crop)
+    for image in progress(judged, "images", len(samples)):
+        scores.append((image.name, image.scores))
+        if folder is not None:
+            write_frame(folder, image.name, image.estimates[-1])
+    return scores
 
-    scene = frame.read()
-    return judge(predictor, scene if crop is None else scene.bottom_right(*crop), stages)
+
+def _samples(options: argparse.Namespace) -> Sequence[Sample]:
+    """The data set that the options name; what cannot be judged shows before a network runs."""
+    generated = {name: getattr(options, name) for name in ("count", "size", "seed")}
+    given = [name for name, value in generated.items() if value is not None]
+    if given and options.dataset != STREETS:
+        raise UsageError(f"--{given[0]} is for --dataset {STREETS}; {options.dataset} has its own")
+    if options.seed is not None and options.split != "train":
+        raise UsageError("the streets that judge have one seed; --seed is for --split train")
+    samples = open_dataset(
+        options.dataset,
+        options.data,
+        options.split,
+        count=options.count,
+        size=options.size,
+        seed=options.seed or 0,
+    )
+    for sample in samples if options.crop else ():
+        require_crop_fits(options.crop, sample.size, sample.name)
+    return samples
 
 
-def overall(scores: Sequence[Scores]) -> Scores:
-    """The scores over all pixels of all frames, by stage."""
-    return {stage: sum((each[stage] for each in scores), Score()) for stage in scores[0]}
+def _submission_folder(options: argparse.Namespace) -> Path:
+    """The new folder for a submission, where the options allow one."""
+    if options.dataset != SUBMITTED:
+        raise UsageError(f"--submission is for --dataset {SUBMITTED}, not {options.dataset}")
+    if options.crop is not None:
+        raise UsageError("a submission needs whole images; leave --crop out")
+    return new_folder(options.submission)
 
 
 def _infer_parser() -> argparse.ArgumentParser:
@@ -146,11 +205,12 @@ def _infer_parser() -> argparse.ArgumentParser:
         "rts2-infer",
         "Disparity, semantics and metric points of stereo pairs. LEFT and RIGHT are two rectified "
         "images, or two folders of equally named ones.",
-        "rts2-infer left.png right.png --model kitti2015.tar --focal 721.5 --baseline 0.54",
+        "rts2-infer left.png right.png --focal 721.5 --baseline 0.54",
     )
     command.add_argument("left", type=Path, metavar="LEFT")
     command.add_argument("right", type=Path, metavar="RIGHT")
-    command.add_argument("--model", type=Path, metavar="FILE", help=f"required: {MODEL}")
+    text = f"{MODEL} (default: {DEFAULT})"
+    command.add_argument("--model", type=named_model, default=DEFAULT, metavar="MODEL", help=text)
     command.add_argument("--stages", type=int, metavar="K", help="stop after this many stages")
     command.add_argument(
         "--focal", type=positive, metavar="PX", help="focal length in pixels, for a point cloud"
@@ -177,18 +237,20 @@ def _evaluate_parser() -> argparse.ArgumentParser:
         "A network's errors on a data set: per stage over all pixels, and per image.",
         "rts2-eval kitti2015.tar --dataset kitti2015 --data KITTI --crop 1232x368",
     )
-    command.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
-    command.add_argument("--dataset", required=True, choices=sorted(DATASETS))
-    command.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="the folder that holds training/"
-    )
-    command.add_argument("--stages", type=int, metavar="K", help="stop after this many stages")
-    command.add_argument(
-        "--crop",
-        type=resolution,
-        metavar="WxH",
-        help="judge the bottom-right corner alone (AnyNet's protocol: 1232x368)",
-    )
+    add = command.add_argument
+    add("model", type=named_model, metavar="MODEL", help=MODEL)
+    add("--dataset", required=True, choices=DATASETS)
+    add("--data", type=Path, metavar="DIR", help=f"its folder; {STREETS} has none")
+    text = "one of the data set's splits, or a file that lists frames (default: what judges)"
+    add("--split", metavar="NAME", help=text)
+    add("--stages", type=int, metavar="K", help="stop after this many stages")
+    text = "judge the bottom-right corner alone (AnyNet's protocol: 1232x368)"
+    add("--crop", type=resolution, metavar="WxH", help=text)
+    text = "also write what KITTI's servers take (--split test) into this new folder"
+    add("--submission", type=Path, metavar="DIR", help=text)
+    add("--count", type=int, metavar="N", help=f"{STREETS}: how many (default: 200)")
+    add("--size", type=resolution, metavar="WxH", help=f"{STREETS}: of the images")
+    add("--seed", type=seed, metavar="S", help=f"{STREETS}, --split train: which (default: 0)")
     add_output(command, out=None)
     return command
 
@@ -313,30 +375,9 @@ def _about(path: Path, predictor: Predictor) -> dict[str, Any]:
     return {"model": str(path), "arch": arch, "origin": predictor.origin}
 
 
-def _report(scores: dict[str, Scores], total: Scores) -> dict[str, Any]:
-    """The figures of rts2.eval/1; what nobody knows is null."""
-    return {
-        "stages": [
-            {
-                "stage": stage,
-                "d1_all": score.d1_all,
-                "d1_bg": score.d1_bg,
-                "d1_fg": score.d1_fg,
-                "epe": score.epe,
-                "miou": score.miou,
-                "iiou": None,
-                "pacc": score.pacc,
-                "pixels": score.everything.pixels,
-                "missing": score.missing,
-            }
-            for stage, score in total.items()
-        ],
-        "images": [
-            {"name": name, "stage": stage, "d1_all": score.d1_all, "epe": score.epe}
-            for name, stages in scores.items()
-            for stage, score in stages.items()
-        ],
-    }
+def _submitted(folder: Path, parts: Sequence[Part]) -> dict[str, Any]:
+    """What a report says of a submission."""
+    return {"folder": str(folder), "parts": [part.to_json() for part in parts]}
 
 
 def _show_pairs(
@@ -359,21 +400,46 @@ def _show_pairs(
     console.print(f"written   {folder}/  NAME_…")
 
 
-def _show_scores(scores: dict[str, Scores], total: Scores, title: str) -> None:
-    columns = ("D1-all %", "D1-bg %", "D1-fg %", "EPE px", "mIoU %", "pAcc %")
-    table = _table("image", "stage", *columns)
-    rows = [*scores.items(), ("all pixels", total)]
-    for name, stages in rows:
-        for stage, score in stages.items():
-            figures = (score.d1_all, score.d1_bg, score.d1_fg, score.epe, score.miou, score.pacc)
-            table.add_row(name, figure(stage, 0), *(figure(value, 2) for value in figures))
-        table.add_section()
+def _show_scores(report: dict[str, Any], title: str, parts: Sequence[Part]) -> None:
+    count = len({image["name"] for image in report["images"]})
+    images = report["images"] if count <= SHOWN_IMAGES else []
+    rows = [*images, *({"name": "all pixels"} | stage for stage in report["stages"])]
+    known = [name for name in TITLES if any(row[name] is not None for row in rows)]
     console = screen()
     console.print(title)
-    console.print(table)
-    missing = max(score.missing for score in total.values())
+    if known:
+        console.print(_figures_table(rows, known))
+    else:
+        console.print(f"{count} images, of which no truth is known: nothing to judge")
+    notes = (*_notes(report), *(f"submission: {part.told()}" for part in parts))
+    for line in notes:
+        console.print(line, soft_wrap=True)
+
+
+def _figures_table(rows: Sequence[dict[str, Any]], known: Sequence[str]) -> Table:
+    """One row an image and stage; columns that nobody knows are left out."""
+    table = _table("image", "stage", *(TITLES[name] for name in known))
+    for index, row in enumerate(rows):
+        figures = (figure(row[name], 2) for name in known)
+        last = index + 1 == len(rows) or rows[index + 1]["name"] != row["name"]
+        table.add_row(row["name"], figure(row["stage"], 0), *figures, end_section=last)
+    return table
+
+
+def _notes(report: dict[str, Any]) -> list[str]:
+    """What the figures rest on, in words."""
+    count = len({image["name"] for image in report["images"]})
+    missing = max(stage["missing"] for stage in report["stages"])
+    notes = [f"{count} images, one by one in --json"] if count > SHOWN_IMAGES else []
     if missing:
-        console.print(f"{missing} pixels had no estimate and were filled from the background")
+        notes.append(f"{missing} pixels had no estimate and were filled from the background")
+    if report["foreground"] is not None:
+        notes.append(f"foreground: {FOREGROUND[report['foreground']]}")
+    if report["object_sizes"] is not None:
+        notes.append(f"iIoU: average object sizes of {OBJECT_SIZES[report['object_sizes']]}")
+    if report["submission"] is not None and report["split"] != "test":
+        notes.append("submission: these are training frames; the servers take --split test")
+    return notes
 
 
 def _table(*columns: str) -> Table:

@@ -7,13 +7,17 @@ in pixels; a figure of nothing is None.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import Rts2Error
+
+if TYPE_CHECKING:
+    from .instances import Objects
 
 Map = NDArray[np.floating[Any]]
 Labels = NDArray[np.integer[Any]]
@@ -59,27 +63,29 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What one image scores, or, added up, many.
-
-    `missing` counts the pixels of the truth for which there was no estimate. They are in no error,
-    unless the holes were filled before.
-    `labels` is a confusion matrix, None without semantics.
-    """
+    """What one image scores, or, added up, many."""
 
     everything: Errors = field(default_factory=Errors)
     background: Errors = field(default_factory=Errors)
     foreground: Errors = field(default_factory=Errors)
+    visible: Errors = field(default_factory=Errors)
+    """Of the pixels that both images see."""
     missing: int = 0
+    """Pixels of the truth without an estimate: in no error, unless the holes were filled before."""
     labels: Counts | None = None
+    """A confusion matrix; None without semantics."""
+    objects: Objects | None = None
+    """What became of the truth's single objects; None where it does not tell them apart."""
 
     def __add__(self, other: Score) -> Score:
-        known = [labels for labels in (self.labels, other.labels) if labels is not None]
         return Score(
             self.everything + other.everything,
             self.background + other.background,
             self.foreground + other.foreground,
+            self.visible + other.visible,
             self.missing + other.missing,
-            sum(known[1:], known[0]) if known else None,
+            _known_sum(self.labels, other.labels),
+            _known_sum(self.objects, other.objects),
         )
 
     @property
@@ -99,6 +105,11 @@ class Score:
         return self.foreground.d1
 
     @property
+    def d1_noc(self) -> float | None:
+        """KITTI's D1 over the pixels that are not occluded."""
+        return self.visible.d1
+
+    @property
     def miou(self) -> float | None:
         return None if self.labels is None else miou(self.labels)
 
@@ -107,25 +118,29 @@ class Score:
         return None if self.labels is None else pixel_accuracy(self.labels)
 
 
-def disparity_score(estimate: Map, truth: Map, foreground: Mask | None = None) -> Score:
+def disparity_score(
+    estimate: Map, truth: Map, foreground: Mask | None = None, visible: Mask | None = None
+) -> Score:
     """Scores `estimate` where both it and `truth` are finite; all are (H, W) in pixels.
 
-    `foreground` splits the errors; without it both parts stay empty. Give what
-    `interpolate_background` returns to score as KITTI's server does.
+    `foreground` splits the errors, `visible` is where both images see the same; without them those
+    parts stay empty. Give what `interpolate_background` returns to score as KITTI's server does.
     """
-    _require_shape(estimate, truth, "estimate", "truth")
+    for array, name in ((estimate, "estimate"), (foreground, "foreground"), (visible, "visible")):
+        if array is not None:
+            _require_shape(array, truth, name, "truth")
     wanted = np.isfinite(truth)
     valid = wanted & np.isfinite(estimate)
-    everything = errors(estimate, truth, valid)
-    missing = int(wanted.sum()) - everything.pixels
-    if foreground is None:
-        return Score(everything, missing=missing)
-    _require_shape(foreground, truth, "foreground", "truth")
+
+    def within(mask: Mask | None) -> Errors:
+        return Errors() if mask is None else errors(estimate, truth, valid & mask)
+
     return Score(
-        everything,
-        errors(estimate, truth, valid & ~foreground),
-        errors(estimate, truth, valid & foreground),
-        missing,
+        everything=errors(estimate, truth, valid),
+        background=within(None if foreground is None else ~foreground),
+        foreground=within(foreground),
+        visible=within(visible),
+        missing=int(wanted.sum()) - int(valid.sum()),
     )
 
 
@@ -135,16 +150,6 @@ def errors(estimate: Map, truth: Map, where: Mask) -> Errors:
     error = np.abs(estimate[where].astype(np.float64) - wanted)
     outliers = (error > OUTLIER_PX) & (error > OUTLIER_SHARE * np.abs(wanted))
     return Errors(error.size, int(outliers.sum()), float(error.sum()))
-
-
-def end_point_error(estimate: Map, truth: Map) -> float | None:
-    """The mean absolute disparity error in pixels, where both maps are finite."""
-    return disparity_score(estimate, truth).epe
-
-
-def d1_all(estimate: Map, truth: Map) -> float | None:
-    """The share of outliers in percent, where both maps are finite."""
-    return disparity_score(estimate, truth).d1_all
 
 
 def interpolate_background(estimate: Map) -> Map:
@@ -181,15 +186,40 @@ def confusion(prediction: Labels, truth: Labels, classes: int) -> Counts:
     return flat.reshape(classes, classes).astype(np.int64)
 
 
+def class_ious(counts: Counts) -> NDArray[np.float64]:
+    """Intersection over union of each class in percent; NaN where it is not defined.
+
+    That is where a class occurs neither in the truth nor in the prediction; one that is only
+    predicted has 0. Cityscapes' and KITTI's evaluations do the same.
+    """
+    hits = np.diagonal(counts)
+    union = counts.sum(0) + counts.sum(1) - hits
+    return ratios(100 * hits, union)
+
+
+def ratios(parts: NDArray[Any], wholes: NDArray[Any]) -> NDArray[np.float64]:
+    """Parts by wholes; NaN where the whole is 0."""
+    return np.where(wholes > 0, parts / np.where(wholes > 0, wholes, 1), np.nan)
+
+
+def known_mean(values: NDArray[np.float64]) -> float | None:
+    """The mean of what is not NaN; None where all is."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None
+
+
 def miou(counts: Counts) -> float | None:
     """Mean intersection over union in percent, of the classes that occur in truth or prediction.
 
     `counts` is the confusion matrix of a whole data set: images of few classes must not weigh more.
     """
-    hits = np.diagonal(counts)
-    union = counts.sum(0) + counts.sum(1) - hits
-    occurs = union > 0
-    return float(100 * (hits[occurs] / union[occurs]).mean()) if occurs.any() else None
+    return known_mean(class_ious(counts))
+
+
+def grouped(counts: Counts, groups: Sequence[int]) -> Counts:
+    """The confusion matrix of groups of classes; `groups` has the group of each class, from 0."""
+    member = np.equal.outer(np.arange(max(groups) + 1), groups).astype(np.int64)
+    return np.asarray(member @ counts @ member.T)
 
 
 def pixel_accuracy(counts: Counts) -> float | None:
@@ -203,6 +233,13 @@ def _carried(rows: Map) -> Map:
     columns = np.where(np.isnan(rows), 0, np.arange(rows.shape[1]))
     carried: Map = np.take_along_axis(rows, np.maximum.accumulate(columns, axis=1), axis=1)
     return carried
+
+
+def _known_sum(one: Any, other: Any) -> Any:
+    """The sum of what is not None."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one + other
 
 
 def _require_shape(given: NDArray[Any], wanted: NDArray[Any], name: str, other: str) -> None:

@@ -5,7 +5,7 @@ No runtime is imported before a model of its kind is opened.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from .arch import MEAN, STD, Arch
 from .data.images import Bytes, Disparity
-from .data.scene import Scene
 from .errors import Rts2Error, UsageError
 from .files import existing_file, parse_json
 from .graph import HEADER, GraphHeader
-from .metrics import Score, confusion, disparity_score, interpolate_background
 from .ops import padded
 
 if TYPE_CHECKING:
@@ -32,9 +30,6 @@ Input = NDArray[np.float32]
 
 MULTIPLE: Final = 32
 """What the sides are padded to for a graph that does not name its arch."""
-
-TRAIN_IDS: Final = 19
-"""Labels are compared with the truth only where a network tells this many classes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +93,6 @@ def prepared(image: Bytes, multiple: int) -> Input:
     shift = np.array(MEAN, np.float32) / np.array(STD, np.float32)
     tensor[0, :, :height, :width] = (image / scale - shift).transpose(2, 0, 1)
     return tensor
-
-
-def judge(predictor: Predictor, scene: Scene, stages: int | None = None) -> dict[int | None, Score]:
-    """One scene's score for each stage that the predictor shows, as KITTI's server would score it.
-
-    Semantics count where both sides have the 19 train ids.
-    """
-    estimates = predictor.predict_stages(scene.left, scene.right, stages)
-    return {estimate.stage: _score(estimate, scene, predictor.arch) for estimate in estimates}
 
 
 class TorchPredictor:
@@ -199,16 +185,6 @@ class OnnxPredictor:
                 f"pads to {width}x{height}; export the checkpoint for {own}"
             )
         return tensor
-
-
-def _score(estimate: Estimate, scene: Scene, arch: Arch | None) -> Score:
-    missing = disparity_score(estimate.disparity, scene.truth).missing
-    filled = interpolate_background(estimate.disparity) if missing else estimate.disparity
-    score = replace(disparity_score(filled, scene.truth, scene.foreground), missing=missing)
-    comparable = arch is None or arch.classes == TRAIN_IDS
-    if estimate.semantic is None or scene.semantic is None or not comparable:
-        return score
-    return replace(score, labels=confusion(estimate.semantic, scene.semantic, TRAIN_IDS))
 
 
 def _enlarged(stage: Stage, size: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:

@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from ..model.box import named_model
 from ..model.console import (
     KITTI,
     add_output,
@@ -20,7 +21,8 @@ from ..model.console import (
     resolution,
     screen,
 )
-from ..model.data.kitti import Sample, samples
+from ..model.data.catalog import STREETS, open_dataset
+from ..model.data.scene import Sample
 from ..model.errors import UsageError
 from ..model.files import existing_file, output_folder, write_bytes, write_json
 
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
     from .report import Metrics, Report
 
 FLOAT, QUANTIZED, REPORT = "fp32.onnx", "fp16.onnx", "quantize.json"
+
+STREETS_JUDGED: Final = 20
+"""How many streets --eval takes."""
 
 EXPORT = ("resolution", "stages", "opset")
 """The options that shape the export of a checkpoint."""
@@ -49,7 +54,7 @@ def quantize(arguments: Sequence[str] | None = None) -> int:
     if options.precision == "int8":
         raise UsageError("int8 is not built yet in this version, fp16 is: --precision fp16")
     existing_file(options.model, "a model (a checkpoint or an ONNX file)")
-    frames = samples(options.eval) if options.eval else ()
+    frames = _frames(options)
     out = output_folder(options.out)
     with TemporaryDirectory() as folder:
         report = _quantized(options, frames, Path(folder), out)
@@ -68,10 +73,14 @@ def _parser() -> argparse.ArgumentParser:
         "rts2-quantize kitti2015.tar --precision fp16 --eval KITTI --out kitti2015-fp16",
     )
     text = "a checkpoint (rts2's .safetensors, AnyNet's released .tar) or an .onnx file of rts2"
-    command.add_argument("model", type=Path, metavar="MODEL", help=text)
+    text = f"{text}, or the name of a network in the box"
+    command.add_argument("model", type=named_model, metavar="MODEL", help=text)
     command.add_argument("--precision", required=True, choices=("fp16", "int8"))
-    text = "KITTI 2015, the folder that holds training/: D1 and EPE before and after"
-    command.add_argument("--eval", type=Path, metavar="DIR", help=text)
+    text = (
+        "D1, EPE and mIoU before and after: on KITTI 2015 (the folder that holds training/), on "
+        f"any pairs (left/, right/, disparity/), or on generated {STREETS}"
+    )
+    command.add_argument("--eval", type=Path, metavar=f"DIR|{STREETS}", help=text)
     text = "of the images, for a checkpoint (default: {}x{})".format(*KITTI)
     command.add_argument("--resolution", type=resolution, metavar="WxH", help=text)
     text = "for a checkpoint: stop after this many stages"
@@ -80,6 +89,26 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--opset", type=int, metavar="N", help=text)
     add_output(command)
     return command
+
+
+def _frames(options: argparse.Namespace) -> Sequence[Sample]:
+    """What --eval names; streets come at the network's own size."""
+    folder: Path | None = options.eval
+    if folder is None:
+        return ()
+    if str(folder) == STREETS:
+        return open_dataset(STREETS, count=STREETS_JUDGED, size=_resolution(options))
+    layout = "folder" if (folder / "left").is_dir() else "kitti2015"
+    return open_dataset(layout, folder)
+
+
+def _resolution(options: argparse.Namespace) -> tuple[int, int]:
+    """Width and height of the images that the network is for."""
+    if options.model.suffix.lower() != ".onnx":
+        return options.resolution or KITTI
+    from ..model.graph import read_header
+
+    return read_header(options.model).resolution
 
 
 def _quantized(
@@ -128,7 +157,7 @@ def _float_graph(options: argparse.Namespace, folder: Path) -> Path:
     from ..model.export import OPSET, export
 
     network, header = load(source)
-    size, opset = options.resolution or KITTI, options.opset or OPSET
+    size, opset = _resolution(options), options.opset or OPSET
     export(network, folder / FLOAT, size, header.origin, opset, options.stages)
     return folder / FLOAT
 

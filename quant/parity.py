@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from ..model.data.scene import Scene
 from ..model.errors import Rts2Error
+from ..model.evaluation import score
 from ..model.metrics import Score
-from ..model.predictor import Estimate, Predictor, judge
+from ..model.predictor import Estimate, Predictor
 
 SHIFT_PX = 24
 """The disparity of the synthetic pair, within reach of every network (d_max of 2 and more)."""
@@ -47,7 +48,7 @@ def measure(reference: Predictor, other: Predictor, scenes: Iterable[Scene]) -> 
         estimates = reference.predict(scene.left, scene.right), _finite(other, scene)
         powers += _powers(estimates[0].disparity, estimates[1].disparity)
         for index, (model, estimate) in enumerate(zip((reference, other), estimates, strict=True)):
-            scores[index] += judge(_Answered(model, estimate), scene)[estimate.stage]
+            scores[index] += score(estimate, scene, model.arch)
     return Measured(scores[0], scores[1], _decibels(*powers))
 
 
@@ -74,21 +75,6 @@ def _finite(model: Predictor, scene: Scene) -> Estimate:
     if not np.isfinite(estimate.disparity).all():
         raise Rts2Error(f"{scene.name}: {remedy}")
     return estimate
-
-
-class _Answered:
-    """A predictor that has its answer already: it can be judged without a second run."""
-
-    def __init__(self, model: Predictor, estimate: Estimate) -> None:
-        self.arch = model.arch
-        self.origin = model.origin
-        self.estimate = estimate
-
-    def predict(self, *_: object) -> Estimate:
-        return self.estimate
-
-    def predict_stages(self, *_: object) -> list[Estimate]:
-        return [self.estimate]
 
 
 def _powers(reference: NDArray[Any], other: NDArray[Any]) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from ..model.arch import UNTRAINED, Precision
+from ..model.box import named_model
 from ..model.console import (
     KITTI,
     add_output,
@@ -180,8 +181,11 @@ def _deploy_parser() -> argparse.ArgumentParser:
     add("--front", type=Path, metavar="front.json", help=text)
     text = "deploy the front's prospect instead of its pick"
     add("--prospect", action="store_true", help=text)
-    text = "a checkpoint; with --front it must hold the pick's arch, and is cut to it"
-    add("--model", type=Path, metavar="CHECKPOINT", help=text)
+    text = (
+        "a checkpoint, or the name of a network in the box; with --front it must hold the pick's "
+        "arch, and is cut to it"
+    )
+    add("--model", type=named_model, metavar="CHECKPOINT", help=text)
     text = "random weights, to try speed and integration without a trained network"
     add("--untrained", action="store_true", help=text)
     add("--seed", type=seed, default=0, help="of the random weights (default: 0)")

@@ -131,6 +131,24 @@ def test_pair_gives_every_file(
     assert b"element vertex 6144\n" in (home / "out" / "0_cloud.ply").read_bytes()
 
 
+def test_without_a_model_the_box_serves(
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    box = home / "box"
+    box.mkdir()
+    (box / "c8.safetensors").write_bytes((models / "full.safetensors").read_bytes())
+    monkeypatch.setattr("rts2.model.box._folder", lambda: box)
+    images = [str(home / side / "0.png") for side in ("left", "right")]
+    told = report(infer, [*images, "--out", str(home / "out")], capsys)
+    assert told["model"] == str(box / "c8.safetensors")
+    assert told["origin"] == "a test"
+    data = ["--dataset", "kitti2015", "--data", str(home / "kitti")]
+    assert report(evaluate, ["c8", *data], capsys)["model"] == told["model"]
+
+
 def test_folders_give_every_pair(
     home: Path, models: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,7 +191,7 @@ def test_network_is_warmed_up_and_timed_in_milliseconds(
     slow = Slow()
     monkeypatch.setattr("rts2.model.predictor.open_model", lambda path: slow)
     folders = [str(home / "left"), str(home / "right")]
-    told = report(infer, [*folders, "--model", "m", "--out", str(home / "out")], capsys)
+    told = report(infer, [*folders, "--model", "m.onnx", "--out", str(home / "out")], capsys)
     assert [pair["network_ms"] for pair in told["pairs"]] == [250.0, 250.0]
     assert slow.runs == 3, "two pairs of one size: one warm-up, one run each"
 
@@ -291,8 +309,9 @@ def wrong(home: Path, models: Path) -> dict[str, tuple[list[str], int, str]]:
         "stages 0": ([*good, "--stages", "0"], 2, "stages must be 1 to 3"),
         "stages 4": ([*good, "--stages", "4"], 2, "stages must be 1 to 3"),
         "stages x": ([*good, "--stages", "x"], 2, "invalid int value"),
-        "no model": ([left, right], 2, "--model is required: a checkpoint"),
-        "missing model": ([left, right, "--model", "none"], 2, "a checkpoint or an ONNX file"),
+        "no model": ([left, right], 2, "c8 is neither; the box of this version is empty"),
+        "missing model": ([left, right, "--model", "n.onnx"], 2, "a checkpoint or an ONNX file"),
+        "unknown name": ([left, right, "--model", "none"], 2, "none is neither; the box"),
         "file for --out": ([*good[:-1], str(home / "file")], 1, "choose another --out"),
         "folder in a file": ([*good[:-1], str(home / "file" / "x")], 1, "choose another --out"),
         "half a camera": ([*good, "--focal", "700"], 2, "both --focal PX and --baseline M"),
@@ -325,6 +344,7 @@ WRONG = [
     "stages x",
     "no model",
     "missing model",
+    "unknown name",
     "file for --out",
     "folder in a file",
     "half a camera",
@@ -337,8 +357,13 @@ WRONG = [
 
 @pytest.mark.parametrize("fault", WRONG)
 def test_wrong_use_of_infer(
-    home: Path, models: Path, capsys: pytest.CaptureFixture[str], fault: str
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    fault: str,
 ) -> None:
+    monkeypatch.setattr("rts2.model.box._folder", lambda: home / "no box")
     cases = wrong(home, models)
     assert list(cases) == WRONG
     arguments, expected, words = cases[fault]
@@ -404,6 +429,26 @@ def test_evaluation_splits_by_the_instances(
         assert entry["miou"] is None
 
 
+def test_evaluation_knows_objects(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = home / "kitti" / "training"
+    put(training / "semantic" / "000000_10.png", np.full((64, 96), 26, np.uint8))
+    put(training / "instance" / "000000_10.png", np.full((64, 96), 26 * 256 + 1, np.uint16))
+    told = report(evaluate, evaluate_arguments(home, models / "full.safetensors"), capsys)
+    assert told["object_sizes"] == "published"
+    scene = [read_rgb(training / f"image_{i}" / "000000_10.png") for i in (2, 3)]
+    semantic = open_model(models / "full.safetensors").predict(*scene).semantic
+    assert semantic is not None
+    entry = told["stages"][-1]
+    share = 100 * (semantic == 13).mean()  # one car: what is found of it, and nothing false
+    assert entry["classes"]["car"]["iou"] == pytest.approx(share)
+    assert entry["classes"]["car"]["iiou"] == pytest.approx(share)
+    vehicle = 100 * (semantic >= 13).mean()
+    human = ((semantic == 11) | (semantic == 12)).any()
+    assert entry["iiou_category"] == pytest.approx(vehicle / (2 if human else 1))
+
+
 def test_crop_judges_the_bottom_right(
     home: Path, models: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -422,6 +467,76 @@ def test_evaluation_table(home: Path, models: Path, capsys: pytest.CaptureFixtur
     assert sum(line.startswith("all pixels") for line in lines) == 3
 
 
+def test_columns_that_nobody_knows_are_left_out(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(evaluate_arguments(home, models / "full.safetensors")) == 0
+    heading = capsys.readouterr().out.splitlines()[1]
+    assert "mIoU cat. %" in heading
+    assert "D1-fg" not in heading
+    assert "iIoU" not in heading
+
+
+def test_table_of_many_images_has_the_totals_alone(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = home / "kitti" / "training"
+    for folder in ("image_2", "image_3", "disp_occ_0", "semantic"):
+        for index in range(1, 21):
+            (training / folder / f"{index:06}_10.png").write_bytes(
+                (training / folder / "000000_10.png").read_bytes()
+            )
+    arguments = evaluate_arguments(home, models / "anynet.safetensors", "--stages", "1")
+    assert evaluate(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "000000_10" not in printed
+    assert "all pixels" in printed
+    assert "21 images, one by one in --json" in printed
+    assert len(report(evaluate, arguments, capsys)["images"]) == 21
+
+
+def test_streets_need_no_folder(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(models / "full.safetensors"), "--dataset", "streets"]
+    told = report(evaluate, [*arguments, "--count", "2", "--size", "96x64"], capsys)
+    assert (told["dataset"], told["split"]) == ("streets", "val")
+    assert told["object_sizes"] in ("data set", None)
+    assert len(told["images"]) == 6
+    assert all(entry["d1_noc"] is not None for entry in told["stages"])
+
+
+def test_submission_of_the_test_frames(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for index in range(2):
+        for side, seed in (("image_2", 0), ("image_3", 10)):
+            put(home / "kitti" / "testing" / side / f"{index:06}_10.png", noise(seed + index))
+    arguments = evaluate_arguments(home, models / "full.safetensors", "--split", "test")
+    told = report(evaluate, [*arguments, "--submission", str(home / "s")], capsys)
+    assert [part["folder"] for part in told["submission"]["parts"]] == ["disp_0", "semantic"]
+    assert {part["frames"] for part in told["submission"]["parts"]} == {2}
+    assert {entry["pixels"] for entry in told["stages"]} == {0}
+    pair = [home / "kitti" / "testing" / f"image_{i}" / "000001_10.png" for i in (2, 3)]
+    expected = open_model(models / "full.safetensors").predict(*map(read_rgb, pair))
+    written = read_disparity(home / "s" / "disp_0" / "000001_10.png")
+    np.testing.assert_allclose(written, expected.disparity, atol=0.5 / 256 + 1e-4)
+    assert evaluate([*arguments, "--submission", str(home / "t")]) == 0
+    printed = capsys.readouterr().out
+    assert "2 images, of which no truth is known: nothing to judge" in printed
+    assert "submission: disp_0/ has 2 of 200 frames, incomplete" in printed
+    assert "training frames" not in printed
+
+
+def test_submission_of_training_frames_says_so(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = evaluate_arguments(home, models / "anynet.safetensors")
+    assert evaluate([*arguments, "--submission", str(home / "s")]) == 0
+    assert "these are training frames; the servers take --split test" in capsys.readouterr().out
+    assert [path.name for path in (home / "s").iterdir()] == ["disp_0"]
+
+
 @pytest.mark.parametrize(
     ("more", "code", "words"),
     [
@@ -430,16 +545,27 @@ def test_evaluation_table(home: Path, models: Path, capsys: pytest.CaptureFixtur
         (["--stages", "4"], 2, "stages must be 1 to 3"),
         (["--data", "none"], 2, "no such folder"),
         (["--dataset", "kitti2042"], 2, "kitti2015"),
+        (["--dataset", "streets"], 2, "leave out --data"),
+        (["--split", "none"], 2, "the splits of kitti2015 are all, train, val, test"),
+        (["--split", "test"], 2, "testing"),
+        (["--count", "3"], 2, "--count is for --dataset streets"),
+        (["--seed", "3"], 2, "--seed is for --dataset streets"),
+        (["--dataset", "streets", "--seed", "3"], 2, "--seed is for --split train"),
+        (["--submission", "s", "--crop", "48x32"], 2, "leave --crop out"),
+        (["--submission", "s", "--dataset", "streets"], 2, "leave out --data"),
+        (["--submission", "kitti"], 2, "needs a new or an empty folder"),
     ],
 )
 def test_wrong_use_of_evaluate(
     home: Path,
     models: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
     more: list[str],
     code: int,
     words: str,
 ) -> None:
+    monkeypatch.chdir(home)
     arguments = evaluate_arguments(home, models / "anynet.safetensors", *more)
     found, line = refusal(evaluate, arguments, capsys)
     assert found == code

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sklearn.metrics as skm
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -12,11 +13,12 @@ from hypothesis.extra.numpy import arrays
 from rts2.model.data.images import read_disparity
 from rts2.model.errors import Rts2Error
 from rts2.model.metrics import (
+    IGNORED,
     Score,
+    class_ious,
     confusion,
-    d1_all,
     disparity_score,
-    end_point_error,
+    grouped,
     interpolate_background,
     miou,
     pixel_accuracy,
@@ -79,17 +81,19 @@ def test_official_sample_after_background_interpolation(real_data: Path) -> None
     kit = real_data / "kitti_devkit"
     filled = interpolate_background(read_disparity(kit / "disp_est.png"))
     truth = read_disparity(kit / "disp_gt.png")
-    assert d1_all(filled, truth) == pytest.approx(13.621, abs=5e-4)
-    assert end_point_error(filled, truth) == pytest.approx(2.3679, abs=5e-5)
-    assert disparity_score(filled, truth).missing == 0
+    score = disparity_score(filled, truth)
+    assert score.d1_all == pytest.approx(13.621, abs=5e-4)
+    assert score.epe == pytest.approx(2.3679, abs=5e-5)
+    assert score.missing == 0
 
 
 def test_outliers_exceed_both_limits() -> None:
     truth = np.array([[10.0, 10.0, 100.0, 100.0, 80.0]])
     # 3 px exactly; 3.5 px; 4 px but 4 %; 6 px and 6 %; 4 px but 5 % exactly
     estimate = np.array([[13.0, 13.5, 104.0, 94.0, 84.0]])
-    assert d1_all(estimate, truth) == pytest.approx(40.0)
-    assert end_point_error(estimate, truth) == pytest.approx((3 + 3.5 + 4 + 6 + 4) / 5)
+    score = disparity_score(estimate, truth)
+    assert score.d1_all == pytest.approx(40.0)
+    assert score.epe == pytest.approx((3 + 3.5 + 4 + 6 + 4) / 5)
 
 
 def test_foreground_and_background_split_the_errors() -> None:
@@ -101,17 +105,29 @@ def test_foreground_and_background_split_the_errors() -> None:
     assert score.everything == score.foreground + score.background
 
 
+def test_visible_pixels_are_judged_by_themselves() -> None:
+    truth = np.array([[10.0, 10.0, 10.0, NAN]])
+    estimate = np.array([[20.0, 10.0, 20.0, 50.0]])
+    seen = np.array([[True, True, False, True]])
+    score = disparity_score(estimate, truth, visible=seen)
+    assert score.d1_noc == 50.0
+    assert (score + score).visible.pixels == 4
+    assert disparity_score(estimate, truth).d1_noc is None
+
+
 def test_figure_of_nothing_is_unknown() -> None:
-    nothing = disparity_score(np.ones((2, 2)), np.full((2, 2), NAN), np.zeros((2, 2), bool))
+    empty = np.zeros((2, 2), bool)
+    nothing = disparity_score(np.ones((2, 2)), np.full((2, 2), NAN), empty, empty)
     figures = (
         nothing.epe,
         nothing.d1_all,
         nothing.d1_bg,
         nothing.d1_fg,
+        nothing.d1_noc,
         nothing.miou,
         nothing.pacc,
     )
-    assert figures == (None,) * 6
+    assert figures == (None,) * 7
     assert nothing.missing == 0
 
 
@@ -126,6 +142,8 @@ def test_maps_of_two_shapes_are_refused() -> None:
         disparity_score(np.ones((2, 3)), np.ones((3, 2)))
     with pytest.raises(Rts2Error, match="foreground and truth"):
         disparity_score(np.ones((2, 3)), np.ones((2, 3)), np.ones((2, 2), bool))
+    with pytest.raises(Rts2Error, match="visible and truth"):
+        disparity_score(np.ones((2, 3)), np.ones((2, 3)), visible=np.ones((2, 2), bool))
 
 
 @given(maps, st.integers(0, 1000))
@@ -228,6 +246,39 @@ def test_confusion_is_that_of_a_plain_loop(data: st.DataObject) -> None:
         if wanted != 255:
             expected[wanted, found] += 1
     assert confusion(prediction, truth, 4).tolist() == expected.tolist()
+
+
+def labels(seed: int, most: int) -> np.ndarray:
+    """Labels 0 … most − 1, some of them ignored."""
+    generator = np.random.default_rng(seed)
+    drawn = generator.integers(0, most, (20, 30)).astype(np.uint8)
+    return np.where(generator.random(drawn.shape) < 0.1, IGNORED, drawn)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_label_metrics_are_those_of_scikit_learn(seed: int) -> None:
+    truth, prediction = labels(seed, 9), labels(seed + 100, 12) % IGNORED
+    counts = confusion(prediction, truth, 14)
+    kept = truth != IGNORED
+    true, found = truth[kept], prediction[kept]
+    assert counts.tolist() == skm.confusion_matrix(true, found, labels=range(14)).tolist()
+    occurring = np.union1d(true, found)
+    ious = skm.jaccard_score(true, found, labels=occurring, average=None)
+    np.testing.assert_allclose(class_ious(counts)[occurring], 100 * ious)
+    assert np.isnan(np.delete(class_ious(counts), occurring)).all()
+    assert miou(counts) == pytest.approx(100 * ious.mean())
+    assert pixel_accuracy(counts) == pytest.approx(100 * skm.accuracy_score(true, found))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_groups_are_scored_as_if_they_had_been_labelled(seed: int) -> None:
+    groups = np.array([0, 0, 1, 2, 1, 2])
+    truth, prediction = labels(seed, 6), labels(seed + 100, 6) % IGNORED
+    kept = truth != IGNORED
+    true, found = groups[truth[kept]], groups[prediction[kept]]
+    counts = grouped(confusion(prediction, truth, 6), groups.tolist())
+    assert counts.tolist() == skm.confusion_matrix(true, found).tolist()
+    assert miou(counts) == pytest.approx(100 * skm.jaccard_score(true, found, average="macro"))
 
 
 @pytest.mark.parametrize(

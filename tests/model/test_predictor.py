@@ -11,13 +11,10 @@ from onnx import TensorProto, helper
 
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, load, save
-from rts2.model.data.scene import Scene
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.predictor import (
-    Estimate,
     OnnxPredictor,
     TorchPredictor,
-    judge,
     open_model,
     prepared,
 )
@@ -249,46 +246,3 @@ def test_corrupt_graph_is_one_line(
 def test_missing_model_is_wrong_use(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="a checkpoint or an ONNX file"):
         open_model(tmp_path / "none.onnx")
-
-
-class Fixed:
-    """A predictor that says what it was told to."""
-
-    arch = FULL
-    origin = None
-
-    def __init__(self, *estimates: Estimate) -> None:
-        self.estimates = list(estimates)
-
-    def predict(self, left: np.ndarray, right: np.ndarray, stages: int | None = None) -> Estimate:
-        return self.estimates[-1]
-
-    def predict_stages(
-        self, left: np.ndarray, right: np.ndarray, stages: int | None = None
-    ) -> list[Estimate]:
-        return self.estimates
-
-
-def test_judging_scores_every_stage() -> None:
-    image = np.zeros((1, 4, 3), np.uint8)
-    truth = np.array([[10, 10, 10, np.nan]], np.float32)
-    labels = np.array([[0, 1, 255, 1]], np.uint8)
-    scene = Scene("0", image, image, truth, semantic=labels)
-    wrong = Estimate(np.full((1, 4), 20, np.float32), np.zeros((1, 4), np.uint8), 1.0, 1)
-    holed = Estimate(np.array([[10, np.nan, 30, 0]], np.float32), labels % 255, 1.0, 2)
-    scores = judge(Fixed(wrong, holed), scene)
-    assert scores[1].d1_all == 100
-    assert scores[1].pacc == pytest.approx(100 / 3)
-    # The hole takes the lesser neighbour, 10 px, as the server does it, and is counted.
-    assert scores[2].d1_all == pytest.approx(100 / 3)
-    assert scores[2].missing == 1
-    assert scores[2].miou == 100
-
-
-def test_other_classes_are_not_judged_by_train_ids() -> None:
-    image = np.zeros((1, 1, 3), np.uint8)
-    scene = Scene("0", image, image, np.ones((1, 1), np.float32), semantic=image[..., 0])
-    predictor = Fixed(Estimate(np.ones((1, 1), np.float32), image[..., 0], 1.0, 1))
-    assert judge(predictor, scene)[1].miou == 100
-    predictor.arch = Arch(c=1, classes=5)
-    assert judge(predictor, scene)[1].miou is None

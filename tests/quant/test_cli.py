@@ -1,6 +1,7 @@
 """rts2-quantize as a user meets it: its files, its JSON, its errors in one line."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -149,6 +150,49 @@ def test_evaluation_is_that_of_the_networks(
     assert report["quantized"]["epe"] == pytest.approx(report["float"]["epe"], rel=1e-2)
     assert report["quantized"]["epe"] != report["float"]["epe"]
     assert report["measured_on"] == f"2 frames of {data}"
+
+
+def test_evaluation_takes_plain_pairs(
+    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same frames in two layouts have the same figures."""
+    official, plain = kitti(tmp_path / "kitti"), tmp_path / "plain"
+    plain.mkdir()
+    for ours, theirs in (("left", "image_2"), ("right", "image_3"), ("disparity", "disp_occ_0")):
+        shutil.copytree(official / "training" / theirs, plain / ours)
+    told = []
+    for data in (official, plain):
+        out = ("--out", tmp_path / f"out of {data.name}")
+        assert run(graph, "--precision", "fp16", "--eval", data, *out, "--json") == 0
+        told.append(reported(capsys))
+    assert told[0]["float"] == told[1]["float"]
+    assert told[1]["measured_on"] == f"2 frames of {plain}"
+
+
+def test_evaluation_takes_streets(
+    checkpoint: Path, graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They come at the network's size: a graph's own, or the one that a checkpoint is given."""
+    told = []
+    for model, size in ((graph, ()), (checkpoint, ("--resolution", "96x64"))):
+        command = (model, "--precision", "fp16", "--eval", "streets", *size)
+        assert run(*command, "--out", tmp_path / model.name, "--json") == 0
+        told.append(reported(capsys))
+    assert told[0]["measured_on"] == "20 frames of streets"
+    assert told[0]["float"]["miou"] is not None
+    assert told[0]["float"]["epe"] == pytest.approx(told[1]["float"]["epe"])
+
+
+def test_a_model_in_the_box_goes_by_its_name(
+    graph: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "small.safetensors").write_bytes(checkpoint.read_bytes())
+    monkeypatch.setattr("rts2.model.box._folder", lambda: tmp_path)
+    size = ("--resolution", "96x64")
+    assert run("small", "--precision", "fp16", "--out", tmp_path / "a", *size) == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path / "b") == 0
+    files = [tmp_path / name / "fp16.onnx" for name in "ab"]
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_an_onnx_file_needs_no_torch(graph: Path, tmp_path: Path) -> None:

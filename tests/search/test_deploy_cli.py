@@ -224,6 +224,17 @@ def test_a_checkpoint_alone_promises_nothing(run: Any, checkpoint: Callable[...,
     assert "No search promised" in (run(*asked).folder / "README.md").read_text()
 
 
+def test_a_network_in_the_box_goes_by_its_name(
+    run: Any, checkpoint: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = checkpoint(PROSPECT)
+    monkeypatch.setattr("rts2.model.box._folder", lambda: path.parent)
+    size = ("--resolution", "90x60")
+    named = run("--device", "cpu", "--model", path.stem, *size, "--json")
+    assert named.code == 0
+    assert named.json["arch"] == PROSPECT.model_dump(mode="json")
+
+
 def test_a_checkpoint_that_does_not_hold_the_pick_is_refused_with_each_difference(
     run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
 ) -> None:

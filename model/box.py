@@ -1,0 +1,61 @@
+"""The networks in the box: trained weights that come with the package, called by name."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Final
+
+from .errors import UsageError
+
+DEFAULT: Final = "c8"
+"""What runs where no model is given."""
+
+SHIPPED: Final = ("c1", "c4", "c8")
+
+SUFFIX: Final = ".safetensors"
+
+
+def named_model(text: str) -> Path:
+    """The file that a user means: a network in the box by its name, or a path as it is given.
+
+    A name is a bare word, without folder and suffix, and the box comes first: one command means
+    one network in every folder. `./c8` is the file of that name.
+
+    Raises `UsageError` for a word that is neither in the box nor a file.
+    """
+    path = Path(text)
+    if not _is_word(text):
+        return path
+    boxed = _folder() / f"{text}{SUFFIX}"
+    if boxed.is_file():
+        return boxed
+    if path.exists():
+        return path
+    raise UsageError(
+        "a model (a checkpoint or an ONNX file) must be a file, or the name of a network in the "
+        f"box: {text} is neither; {_listed()}"
+    )
+
+
+def names() -> tuple[str, ...]:
+    """The networks that this installation has."""
+    folder = _folder()
+    return tuple(sorted(path.stem for path in folder.glob(f"*{SUFFIX}"))) if folder.is_dir() else ()
+
+
+def _is_word(text: str) -> bool:
+    return text not in ("", ".", "..") and Path(text).name == text and not Path(text).suffix
+
+
+def _listed() -> str:
+    found = names()
+    return (
+        f"the box holds {', '.join(found)}"
+        if found
+        else "the box of this version is empty, give a file"
+    )
+
+
+def _folder() -> Path:
+    return Path(str(resources.files(__package__) / "weights"))

@@ -1,0 +1,57 @@
+"""A name means the network in the box, wherever the command runs; a path means itself."""
+
+from pathlib import Path
+
+import pytest
+
+from rts2.model.box import DEFAULT, SHIPPED, named_model, names
+from rts2.model.errors import UsageError
+
+
+@pytest.fixture
+def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A box of two networks, and an empty folder to work in."""
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    for name in ("c1.safetensors", "c8.safetensors", "c8.json"):
+        (folder / name).touch()
+    monkeypatch.setattr("rts2.model.box._folder", lambda: folder)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return folder
+
+
+def test_a_name_is_the_network_in_the_box(box: Path) -> None:
+    assert named_model("c8") == box / "c8.safetensors"
+    assert names() == ("c1", "c8")
+
+
+def test_the_box_comes_before_a_file_of_its_name(box: Path) -> None:
+    Path("c8").touch()
+    assert named_model("c8") == box / "c8.safetensors"
+    assert named_model("./c8") == Path("c8")
+
+
+@pytest.mark.parametrize("text", ["model.onnx", "sub/c8", "/c8", "c8.safetensors", ".", ".."])
+def test_a_path_is_itself(box: Path, text: str) -> None:
+    assert named_model(text) == Path(text)
+
+
+def test_a_word_may_be_a_file(box: Path) -> None:
+    Path("mine").touch()
+    assert named_model("mine") == Path("mine")
+
+
+def test_an_unknown_word_lists_the_box(box: Path) -> None:
+    with pytest.raises(UsageError, match="c9 is neither; the box holds c1, c8"):
+        named_model("c9")
+
+
+def test_a_box_that_is_not_there(box: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rts2.model.box._folder", lambda: box / "none")
+    with pytest.raises(UsageError, match="the box of this version is empty, give a file"):
+        named_model(DEFAULT)
+
+
+def test_the_default_is_shipped() -> None:
+    assert DEFAULT in SHIPPED
