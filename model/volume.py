@@ -52,8 +52,11 @@ def residual_volume(left: Tensor, right: Tensor, disparity: Tensor) -> Tensor:
 def soft_argmin(cost: Tensor, first: int) -> Tensor:
     """The expected plane under softmax(−cost): (B, P, H, W) → (B, 1, H, W), in planes.
 
-    The planes stand for `first`, `first` + 1, … Source: Kendall et al. 2017, equation 1.
+    The planes stand for `first`, `first` + 1, … Costs of half precision are taken in fp32: 8 bits
+    hold no disparity. Source: Kendall et al. 2017, equation 1.
     """
+    if cost.dtype in (torch.bfloat16, torch.float16):
+        cost = cost.float()
     planes = torch.arange(first, first + cost.shape[1], dtype=cost.dtype, device=cost.device)
     weights = torch.softmax(-cost, 1)
     return (weights * planes.view(1, -1, 1, 1)).sum(1, keepdim=True)
