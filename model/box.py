@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
+from .arch import Arch
 from .errors import UsageError
 
 DEFAULT: Final = "c8"
@@ -42,6 +43,17 @@ def names() -> tuple[str, ...]:
     """The networks that this installation has."""
     folder = _folder()
     return tuple(sorted(path.stem for path in folder.glob(f"*{SUFFIX}"))) if folder.is_dir() else ()
+
+
+def holding(arch: Arch) -> Path | None:
+    """The network in the box out of which `arch` can be cut; None where there is none."""
+    from .checkpoint import read_header
+
+    for name in names():
+        path = _folder() / f"{name}{SUFFIX}"
+        if not arch.missing_from(read_header(path).arch):
+            return path
+    return None
 
 
 def _is_word(text: str) -> bool:

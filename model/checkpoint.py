@@ -96,7 +96,19 @@ def _finite(value: Tensor) -> bool:
     return not value.is_floating_point() or bool(value.isfinite().all())
 
 
+def read_header(path: Path) -> Header:
+    """What a checkpoint of ours says of itself, without its weights; raises as `load` does."""
+    return _read_own(path, weights=False)[0]
+
+
 def _load_own(path: Path) -> tuple[Network, Header]:
+    header, weights = _read_own(path)
+    network = build(header.arch)
+    _fill(network, weights, path)
+    return network, header
+
+
+def _read_own(path: Path, weights: bool = True) -> tuple[Header, dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get(HEADER)
@@ -105,13 +117,11 @@ def _load_own(path: Path) -> tuple[Network, Header]:
                     f"{path} holds no arch; rts2 reads the checkpoints that rts2 writes, "
                     "and AnyNet's released ones"
                 )
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = file.keys() if weights else ()
+            tensors = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise Rts2Error(f"{path} is truncated or no safetensors file: {error}") from error
-    known = parse_json(header, Header, f"the header of {path}")
-    network = build(known.arch)
-    _fill(network, weights, path)
-    return network, known
+    return parse_json(header, Header, f"the header of {path}"), tensors
 
 
 def _import_anynet(path: Path) -> tuple[Network, Header]:

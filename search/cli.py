@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from ..model.arch import UNTRAINED, Precision
-from ..model.box import named_model
+from ..model.box import holding, named_model
 from ..model.console import (
     KITTI,
     add_output,
@@ -173,7 +173,7 @@ def _deploy_parser() -> argparse.ArgumentParser:
         "rts2-deploy",
         "Writes the folder that runs a network on a device: the ONNX graph, its configuration, "
         "how to build it there and how to check it there.",
-        "rts2-deploy --front rts2-out/front.json --device tx2 --model trained.safetensors",
+        "rts2-deploy --front rts2-out/front.json --device tx2",
     )
     add = described.add_argument
     add("--device", required=True, help=f"{', '.join(names())}, or a device profile's JSON file")
@@ -183,7 +183,7 @@ def _deploy_parser() -> argparse.ArgumentParser:
     add("--prospect", action="store_true", help=text)
     text = (
         "a checkpoint, or the name of a network in the box; with --front it must hold the pick's "
-        "arch, and is cut to it"
+        "arch, and is cut to it (default: the network in the box that holds it)"
     )
     add("--model", type=named_model, metavar="CHECKPOINT", help=text)
     text = "random weights, to try speed and integration without a trained network"
@@ -229,13 +229,18 @@ def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Net
         if not header.trained and not options.untrained:
             raise UsageError(f"{options.model} is untrained; --untrained deploys it all the same")
         return (cut(network, asked.arch) if asked else network), header.origin
+    assert asked is not None, "without a model there is a front"
     if not options.untrained:
-        raise UsageError(
-            "a bundle needs weights: give --model CHECKPOINT, or say --untrained for random ones"
-        )
+        boxed = holding(asked.arch)
+        if boxed is None:
+            raise UsageError(
+                f"no network in the box holds {asked.arch.label()}: give --model CHECKPOINT, or "
+                "say --untrained for random weights"
+            )
+        network, header = load_checkpoint(boxed)
+        return cut(network, asked.arch), f"{boxed.stem} of the box, {header.origin}"
     import torch
 
-    assert asked is not None, "without a model there is a front"
     torch.manual_seed(options.seed)
     return build(asked.arch), UNTRAINED
 

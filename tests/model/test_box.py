@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from rts2.model.box import DEFAULT, SHIPPED, named_model, names
+from rts2.model.arch import Arch
+from rts2.model.box import DEFAULT, SHIPPED, holding, named_model, names
+from rts2.model.checkpoint import build, save
 from rts2.model.errors import UsageError
 
 
@@ -51,6 +53,14 @@ def test_a_box_that_is_not_there(box: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("rts2.model.box._folder", lambda: box / "none")
     with pytest.raises(UsageError, match="the box of this version is empty, give a file"):
         named_model(DEFAULT)
+
+
+def test_an_arch_is_found_in_the_network_that_holds_it(box: Path) -> None:
+    for c in (1, 8):
+        save(build(Arch(c=c)), box / f"c{c}.safetensors", "trained on nothing")
+    assert holding(Arch(c=8, stages=2)) == box / "c8.safetensors"
+    assert holding(Arch(c=1, semantic=False)) == box / "c1.safetensors"
+    assert holding(Arch(c=2)) is None
 
 
 def test_the_default_is_shipped() -> None:

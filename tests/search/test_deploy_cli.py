@@ -235,6 +235,19 @@ def test_a_network_in_the_box_goes_by_its_name(
     assert named.json["arch"] == PROSPECT.model_dump(mode="json")
 
 
+def test_a_pick_takes_its_weights_from_the_box(
+    run: Any,
+    front: Callable[..., Path],
+    checkpoint: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = checkpoint(WHOLE)
+    monkeypatch.setattr("rts2.model.box._folder", lambda: path.parent)
+    told = run("--device", "cpu", "--front", front("cpu"), "--json").json
+    assert told["arch"] == PICK.model_dump(mode="json")
+    assert told["weights"].startswith(f"{path.stem} of the box, ")
+
+
 def test_a_checkpoint_that_does_not_hold_the_pick_is_refused_with_each_difference(
     run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
 ) -> None:
