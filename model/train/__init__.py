@@ -1,0 +1,1 @@
+"""Training: the paper's schedule, on one processor or many, resumable at any step."""

@@ -1,0 +1,105 @@
+"""What a run learns from: its samples, and how often each class occurs in them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader, Dataset
+
+from ..data.cache import Cached
+from ..data.catalog import DATASETS, open_dataset
+from ..data.scene import Sample
+from ..errors import Rts2Error, UsageError
+from ..metrics import IGNORED
+from .distributed import World
+from .loader import Fault, one_thread, require_labels
+from .recipe import Recipe
+
+Shown = Callable[[Iterable[Any], str, int], Iterable[Any]]
+"""Passes items on and shows how far they are: (items, title, total)."""
+
+
+def names_digest(samples: Sequence[Sample]) -> str:
+    """The SHA-256 of all names in their order."""
+    return hashlib.sha256("\n".join(sample.name for sample in samples).encode()).hexdigest()
+
+
+class LabelCounts(Dataset[Any]):
+    """How many pixels of a sample each class has."""
+
+    def __init__(self, samples: Sequence[Sample], chosen: Sequence[int], classes: int) -> None:
+        self.samples, self.chosen, self.classes = samples, chosen, classes
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, place: int) -> NDArray[np.int64] | Fault:
+        try:
+            labels = require_labels(self.samples[self.chosen[place]].read(), self.classes)
+        except Rts2Error as error:
+            return Fault(str(error), isinstance(error, UsageError))
+        except OSError as error:
+            return Fault(f"cannot read {self.samples[self.chosen[place]].name}: {error}", False)
+        return np.bincount(labels[labels != IGNORED], minlength=self.classes).astype(np.int64)
+
+
+def class_shares(
+    samples: Sequence[Sample], recipe: Recipe, workers: int, world: World, shown: Shown
+) -> NDArray[np.float64]:
+    """Each class's share of the labelled pixels, counted on evenly spaced samples.
+
+    Raises `Rts2Error` where a sample has no labels or wrong ones.
+    """
+    wanted = min(recipe.counted, len(samples))
+    chosen = [place * len(samples) // wanted for place in range(wanted)]
+    mine = chosen[world.rank :: world.size]
+    counted = DataLoader(
+        LabelCounts(samples, mine, recipe.arch.classes),
+        batch_size=None,
+        num_workers=workers,
+        worker_init_fn=one_thread,
+        generator=torch.Generator(),  # of the workers' seeds, which nothing here uses
+    )
+    pixels = np.zeros(recipe.arch.classes, np.int64)
+    for counts in shown(counted, "counting classes", len(mine)):
+        if isinstance(counts, Fault):
+            raise counts.error()
+        pixels += np.asarray(counts)
+    pixels = np.array(world.total(pixels.tolist()))
+    if not pixels.any():
+        raise Rts2Error(
+            f"the semantic branch learns from labels: {wanted} samples have no labelled pixel; "
+            "train --branches disparity"
+        )
+    shares: NDArray[np.float64] = pixels / pixels.sum()
+    return shares
+
+
+def open_samples(recipe: Recipe, folder: Path | None) -> Sequence[Sample]:
+    """The training samples of a recipe; generated ones are of the size of a crop.
+
+    Raises `UsageError` for an unknown data set, folder or split.
+    """
+    height, width = recipe.crop
+    split = recipe.split
+    if split is None and recipe.dataset in DATASETS:
+        split = DATASETS[recipe.dataset].trained
+    return open_dataset(
+        recipe.dataset,
+        folder,
+        split,
+        count=recipe.count,
+        size=(width, height),
+        seed=recipe.data_seed,
+    )
+
+
+def cached(samples: Sequence[Sample], folder: Path | None) -> Sequence[Sample]:
+    """The same samples, each read once and kept in `folder`."""
+    return samples if folder is None else Cached(samples, folder)
