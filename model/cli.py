@@ -36,6 +36,7 @@ from .data.images import (
     write_image,
     write_indexed,
 )
+from .data.layout import IMAGES, images_of
 from .data.scene import Sample, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
@@ -47,9 +48,6 @@ if TYPE_CHECKING:
 
     from .data.images import Bytes
     from .predictor import Estimate, Predictor
-
-SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
-"""What counts as an image in a folder."""
 
 MODEL = (
     f"{', '.join(SHIPPED)} in the box, a checkpoint (rts2's .safetensors, AnyNet's released .tar), "
@@ -142,6 +140,8 @@ def evaluate(arguments: Sequence[str] | None = None) -> int:
         **_about(options.model, predictor),
         "dataset": options.dataset,
         "split": options.split,
+        "samples": len(samples),
+        "data": getattr(samples, "fingerprint", None),
         "crop": options.crop,
         "foreground": samples[0].foreground,
         **evaluation.report(scores, options.dataset),
@@ -296,7 +296,7 @@ def _pair(left: Path, right: Path) -> Pair:
 
 def _partners(left: Path, right: Path) -> list[tuple[Path, Path]]:
     """The equally named images of two folders; one without partner is an error."""
-    found = [_images(folder) for folder in (left, right)]
+    found = [images_of(folder) for folder in (left, right)]
     for folder, images, others in ((right, found[1], found[0]), (left, found[0], found[1])):
         lacking = sorted(others.keys() - images.keys())
         if lacking:
@@ -305,21 +305,8 @@ def _partners(left: Path, right: Path) -> list[tuple[Path, Path]]:
                 f"({len(others)} images against {len(images)})"
             )
     if not found[0]:
-        raise UsageError(f"a folder must hold images ({', '.join(SUFFIXES)}); {left} holds none")
+        raise UsageError(f"a folder must hold images ({', '.join(IMAGES)}); {left} holds none")
     return [(found[0][stem], found[1][stem]) for stem in sorted(found[0])]
-
-
-def _images(folder: Path) -> dict[str, Path]:
-    """The images of a folder by stem, which must be unique: it names the results."""
-    images: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES and path.is_file():
-            if path.stem in images:
-                raise UsageError(
-                    f"names must differ before the suffix: {path} and {images[path.stem].name}"
-                )
-            images[path.stem] = path
-    return images
 
 
 def _warm(predictor: Predictor, pairs: list[Pair], stages: int | None) -> None:

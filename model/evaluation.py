@@ -11,7 +11,16 @@ import numpy as np
 from .arch import Arch
 from .data.labels import CATEGORIES, CLASS_NAMES
 from .data.scene import Sample, Scene
-from .instances import Objects, Sizes, class_iious, iiou, iiou_category, objects, published_sizes
+from .instances import (
+    CLASSES,
+    Objects,
+    Sizes,
+    class_iious,
+    iiou,
+    iiou_category,
+    objects,
+    published_sizes,
+)
 from .metrics import (
     Counts,
     Score,
@@ -25,9 +34,6 @@ from .metrics import (
 
 if TYPE_CHECKING:
     from .predictor import Estimate, Predictor
-
-TRAIN_IDS: Final = len(CLASS_NAMES)
-"""Labels are compared with the truth only where a network tells this many classes."""
 
 Scores = dict[int | None, Score]
 """By stage, the last one last; None where a graph does not say which it shows."""
@@ -95,10 +101,10 @@ def score(estimate: Estimate, scene: Scene, arch: Arch | None) -> Score:
     filled = interpolate_background(estimate.disparity) if holes.any() else estimate.disparity
     judged = disparity_score(filled, scene.truth, scene.foreground, scene.visible)
     judged = replace(judged, missing=int(holes.sum()))
-    comparable = arch is None or arch.classes == TRAIN_IDS
+    comparable = arch is None or arch.classes == CLASSES
     if estimate.semantic is None or scene.semantic is None or not comparable:
         return judged
-    labels = confusion(estimate.semantic, scene.semantic, TRAIN_IDS)
+    labels = confusion(estimate.semantic, scene.semantic, CLASSES)
     if scene.instances is None:
         return replace(judged, labels=labels)
     found = objects(estimate.semantic, scene.semantic, scene.instances)
@@ -142,7 +148,7 @@ def by_class(score: Score, weights: Weights | None) -> Mapping[str, Figures] | N
     if score.labels is None:
         return None
     known = _weighed(score, weights)
-    unknown = np.full(TRAIN_IDS, np.nan)
+    unknown = np.full(CLASSES, np.nan)
     columns = class_ious(score.labels), unknown if known is None else class_iious(*known)
     rows = zip(CLASS_NAMES, *columns, strict=True)
     return {name: {"iou": _known(iou), "iiou": _known(weighed)} for name, iou, weighed in rows}

@@ -13,6 +13,7 @@ from . import folder as plain
 from .frame import Frame
 from .layout import chosen, read_names
 from .scene import Sample
+from .streets import Look, Streets
 
 STREETS: Final = "streets"
 
@@ -24,6 +25,8 @@ VAL_SEED: Final = 2**32 - 1
 
 STREETS_COUNT: Final[Mapping[str, int]] = {"train": 10_000, "val": 200}
 """How many streets a split has unless told."""
+
+STREETS_MOST: Final = 1_000_000
 
 STREETS_SIZE: Final = (1242, 375)
 
@@ -130,11 +133,13 @@ def open_dataset(
     count: int | None = None,
     size: tuple[int, int] | None = None,
     seed: int = 0,
+    rectification_px: float = 0.0,
 ) -> Sequence[Sample]:
     """The samples of a data set, none of them read yet.
 
     `split` is one of the row's splits, or a file that lists frames; None stands for the split that
-    judges. `count`, `size` (width, height) and `seed` are for `streets`, the rest has its own;
+    judges. `count`, `size` (width, height), `seed` and `rectification_px`, the spread of a vertical
+    offset of the right image, are for `streets`, the rest has its own;
     the streets that judge have a seed of their own, whatever `seed` says.
 
     Raises:
@@ -146,7 +151,8 @@ def open_dataset(
         raise UsageError(f"a data set must be one of {', '.join(DATASETS)}, not {name!r}")
     wanted = row.judged if split is None else str(split)
     if row.frames is None:
-        return _streets(row, folder, wanted, count, size or STREETS_SIZE, seed)
+        look = Look(rectification_px=rectification_px)
+        return _streets(row, folder, wanted, count, size or STREETS_SIZE, seed, look)
     if folder is None:
         raise UsageError(f"{name} needs its folder ({row.about}); give --data DIR")
     if wanted in row.splits:
@@ -163,10 +169,9 @@ def _streets(
     count: int | None,
     size: tuple[int, int],
     seed: int,
+    look: Look,
 ) -> Sequence[Sample]:
     """Generated scenes: what trains and what judges differ in their seed."""
-    from .streets import Streets
-
     if folder is not None:
         raise UsageError(f"{STREETS} are generated and have no folder; leave out --data {folder}")
     if split not in row.splits:
@@ -174,7 +179,9 @@ def _streets(
     if split == "train" and seed == VAL_SEED:
         raise UsageError(f"the seed {VAL_SEED} belongs to the streets that judge; take another")
     count = STREETS_COUNT[split] if count is None else count
-    return Streets(count, seed if split == "train" else VAL_SEED, size)
+    if not 1 <= count <= STREETS_MOST:
+        raise UsageError(f"{STREETS} may be 1 to {STREETS_MOST}, not {count}; change --count")
+    return Streets(count, seed if split == "train" else VAL_SEED, size, look)
 
 
 def _no_split(name: str, row: Dataset, found: str) -> UsageError:

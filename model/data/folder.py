@@ -7,17 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from ..errors import Rts2Error, UsageError
+from ..errors import Rts2Error
 from ..files import existing_file
 from .frame import Coding, Frame
 from .images import Bytes, Disparity, read_disparity, read_whole
 from .kitti import own_objects
 from .labels import require_train_ids
-from .layout import Column, require_folder, require_folders, rows
+from .layout import IMAGES, Column, images_of, require_folder, require_folders, rows
 from .pfm import read_pfm_disparity, require_disparity
 
 TITLE: Final = "a data set of pairs"
-IMAGES: Final = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 DISPARITIES: Final = {".png": read_disparity, ".pfm": read_pfm_disparity}
 
 
@@ -66,13 +65,4 @@ CODING: Final = Coding("folder", read_any_disparity, read_train_ids, own_objects
 
 
 def _column(folder: Path, suffixes: tuple[str, ...]) -> Column:
-    """The files of a folder by stem, which must be unique."""
-    files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith("."):
-            if path.stem in files:
-                raise UsageError(
-                    f"names must differ before the suffix: {path} and {files[path.stem].name}"
-                )
-            files[path.stem] = path
-    return Column(folder, f"*({'|'.join(suffixes)})", files)
+    return Column(folder, f"*({'|'.join(suffixes)})", images_of(folder, suffixes))

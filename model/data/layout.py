@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Final
 
 from ..errors import Rts2Error, UsageError
 from ..files import existing_file
@@ -12,6 +13,10 @@ from .frame import Frame
 
 SHOWN = 8
 """How many entries of a folder an error names."""
+
+
+IMAGES: Final = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
+"""What counts as an image in a folder of the user's."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,22 @@ class Column:
     def tail(self) -> str:
         """What follows a frame's name in its file's name."""
         return self.pattern.rpartition("*")[2]
+
+
+def images_of(folder: Path, suffixes: Sequence[str] = IMAGES) -> dict[str, Path]:
+    """The files of a folder with one of these suffixes, by stem.
+
+    Raises `UsageError` where two have one stem: it is what a pair's files have in common.
+    """
+    files: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith("."):
+            if path.stem in files:
+                raise UsageError(
+                    f"names must differ before the suffix: {path} and {files[path.stem].name}"
+                )
+            files[path.stem] = path
+    return files
 
 
 def column(folder: Path, pattern: str) -> Column:

@@ -57,7 +57,7 @@ def read_pfm_disparity(path: Path) -> Disparity:
 
 def require_disparity(values: Disparity, path: Path) -> Disparity:
     """The values, if none is negative: that would be another sign, or the right image's map."""
-    lowest = np.fmin.reduce(values, axis=None)
+    lowest = np.fmin.reduce(values, axis=None, initial=np.inf)
     if lowest < 0:
         raise Rts2Error(
             f"disparities of the left image must be 0 or more, left minus right column: "

@@ -17,8 +17,8 @@ from ...errors import Rts2Error, UsageError
 from ..scene import Foreground, Scene
 
 if TYPE_CHECKING:
-    from .layout import Soup
     from .render import Camera, Light
+    from .soup import Soup
 
 FOCAL_PX = 721.5377
 BASELINE_M = 0.54
@@ -26,10 +26,10 @@ KITTI_SIZE = (1242, 375)
 CENTRE = (609.559, 172.854)
 """KITTI's rectified colour cameras."""
 
-NEAREST_M = 2.75
-"""Nothing comes closer: 192 pixels of disparity are as much as the network looks for."""
+NEAREST_M = 2.1
+"""Nothing that stands on the street comes closer: 185 pixels of disparity in KITTI's frames."""
 
-VERSION = 1
+VERSION = 2
 """Another generator makes other scenes."""
 
 
@@ -62,7 +62,11 @@ class Street:
         return "instance"
 
     def read(self) -> Scene:
-        """The images, the exact disparity (0 in the sky), labels, occlusion and objects."""
+        """The images, the exact disparity (0 in the sky), labels, occlusion and objects.
+
+        Raises `Rts2Error` on a machine for which the ray caster has no wheel.
+        """
+        _require_caster()
         return _scene(self)
 
 
@@ -78,7 +82,6 @@ class Streets(Sequence[Street]):
     ) -> None:
         if count < 1:
             raise UsageError(f"streets needs a count of at least 1, not {count}")
-        _require_caster()
         self.seed, self.size, self.look = seed, size, look or Look()
         self._range = range(count)
 
@@ -120,7 +123,7 @@ def _scene(street: Street) -> Scene:
     yaw = float(rng.normal(0, 0.05))
     pose = _pose(rng, yaw)
     soup = drawn(rng, yaw, camera.sides)
-    world = render.World(_cleared(soup.seen(pose), camera), _light(rng, pose))
+    world = render.World(_cleared(soup.seen(pose), camera.nearest_m), _light(rng, pose))
     offset = rng.normal(0, 1) * street.look.rectification_px
     width, height = camera.size
     x, y = camera.grid()
@@ -135,6 +138,7 @@ def _scene(street: Street) -> Scene:
     noise = rng if street.look.noise else None
     ids, things = render.labels(world, hits)
     disparity = camera.focal_px * camera.baseline_m / hits.depth
+    visible = render.visible(world, hits, None if offset else seen, rays, camera, x)
     return Scene(
         name=street.name,
         left=sensor.expose(first, eyes[0], noise),
@@ -142,7 +146,7 @@ def _scene(street: Street) -> Scene:
         truth=disparity.reshape(height, width).astype(np.float32),
         foreground=(things != 0).reshape(height, width),
         semantic=ids.reshape(height, width),
-        visible=render.visible(world, hits, seen, rays, camera, x).reshape(height, width),
+        visible=visible.reshape(height, width),
         instances=things.reshape(height, width),
     )
 
@@ -154,9 +158,9 @@ def _camera(rng: np.random.Generator, size: tuple[int, int]) -> Camera:
     scale = max(1.0, size[0] / KITTI_SIZE[0], size[1] / KITTI_SIZE[1])
     room = [scale * whole - side for whole, side in zip(KITTI_SIZE, size, strict=True)]
     x, y = (rng.uniform(0, max(space, 0.0)) for space in room)
-    focal = FOCAL_PX * scale * (1.0 if size == KITTI_SIZE else np.exp(rng.normal(0, 0.1)))
-    centre = (scale * CENTRE[0] - x, scale * CENTRE[1] - y)
-    return Camera(float(focal), (float(centre[0]), float(centre[1])), size, BASELINE_M)
+    zoom = 1.0 if size == KITTI_SIZE else float(np.exp(rng.normal(0, 0.1)))
+    centre = (float(scale * CENTRE[0] - x), float(scale * CENTRE[1] - y))
+    return Camera(FOCAL_PX * scale * zoom, centre, size, BASELINE_M, NEAREST_M * zoom)
 
 
 def _pose(rng: np.random.Generator, yaw: float) -> NDArray[np.float64]:
@@ -173,12 +177,13 @@ def _turn(angle: float) -> tuple[float, float]:
     return float(np.cos(angle)), float(np.sin(angle))
 
 
-def _cleared(soup: Soup, camera: Camera) -> Soup:
+def _cleared(soup: Soup, nearest_m: float) -> Soup:
     """The street, in camera coordinates, without what stands too close before the camera."""
-    x, y, z = (soup.corners[..., axis] for axis in range(3))
-    nearest = NEAREST_M * camera.focal_px / FOCAL_PX
-    before = (z < nearest) & (z > -1.5) & (y < 1.3)
-    close = (before & (np.abs(x) < 1.3 * np.maximum(z, 0) + 0.9)).any(1)
+    from .soup import GROUND
+
+    x, _, z = (soup.corners[..., axis] for axis in range(3))
+    before = (z < nearest_m) & (z > -1.5) & (np.abs(x) < 1.3 * np.maximum(z, 0) + 0.9)
+    close = before.any(1) & ~np.isin(soup.label, GROUND)
     return soup.only(~np.isin(soup.part, np.unique(soup.part[close])))
 
 

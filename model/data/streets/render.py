@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import SKY, Soup
+from .soup import SKY, Soup
 from .textures import sample
 
 Floats = NDArray[np.float32]
@@ -31,6 +31,8 @@ class Camera:
     size: tuple[int, int]
     """Width and height of the window."""
     baseline_m: float
+    nearest_m: float = 0.0
+    """Nothing that stands on the street is nearer."""
 
     @property
     def sides(self) -> tuple[float, float]:
@@ -277,22 +279,18 @@ def labels(world: World, hits: Hits) -> tuple[NDArray[np.uint8], NDArray[np.int3
 
 
 def visible(
-    world: World, hits: Hits, seen: Hits, rays: Floats, camera: Camera, x: Floats
+    world: World, hits: Hits, seen: Hits | None, rays: Floats, camera: Camera, x: Floats
 ) -> NDArray[np.bool_]:
     """Whether the right eye sees what each pixel of the left one shows.
 
-    `seen` is what the right eye's pixels show. Where both pixels beside the place lie as far as
-    the surface does, it is seen; everywhere else a ray from the right eye decides.
+    `seen` is what the right eye's pixels show, None where its rows are not those of the left one.
+    Where both pixels beside the place lie as far as the surface does, it is seen; everywhere else
+    a ray from the right eye decides.
     """
     disparity = camera.focal_px * camera.baseline_m / hits.depth
-    width = camera.size[0]
     column = x - disparity
     inside = column >= 0
-    nearest = np.clip(column.astype(np.int64), 0, width - 2) + np.arange(x.size) // width * width
-    sides = (seen.depth.take(nearest), seen.depth.take(nearest + 1))
-    with np.errstate(invalid="ignore"):
-        sure = [np.abs(side - hits.depth) <= 0.004 * hits.depth for side in sides]
-    doubtful = np.flatnonzero(inside & ~(sure[0] & sure[1]))
+    doubtful = np.flatnonzero(inside & ~_surely(hits, seen, column, camera.size[0]))
     eye = np.array([camera.baseline_m, 0, 0], np.float32)
     depth = hits.depth.take(doubtful)
     sky = np.isinf(depth)
@@ -301,3 +299,19 @@ def visible(
     start = np.broadcast_to(eye, point.shape).copy()
     inside[doubtful] = ~world.blocked(start, point.astype(np.float32), 0.9985)
     return inside
+
+
+def _surely(
+    hits: Hits, seen: Hits | None, column: NDArray[np.float64], width: int
+) -> NDArray[np.bool_]:
+    """Where the right eye's pixels to both sides of `column` are as far away as the surface."""
+    if seen is None:
+        return np.zeros(len(column), bool)
+    left = np.clip(column.astype(np.int64), 0, width - 2)
+    left += np.arange(column.size) // width * width
+    with np.errstate(invalid="ignore"):
+        close = [
+            np.abs(seen.depth.take(place) - hits.depth) <= 0.004 * hits.depth
+            for place in (left, left + 1)
+        ]
+    return np.asarray(close[0] & close[1])

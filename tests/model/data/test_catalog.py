@@ -1,9 +1,8 @@
 """Every data set is opened by its name, its split, or a list of frames."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from rts2.model.data.cache import Cached
 from rts2.model.data.catalog import DATASETS, VAL_SEED, open_dataset
 from rts2.model.data.kitti import open_2015
+from rts2.model.data.streets import Streets
 from rts2.model.errors import UsageError
 
 
@@ -20,13 +20,6 @@ def kitti(tmp_path: Path, put: Callable[..., Path]) -> Path:
         for folder in ("image_2", "image_3", "disp_occ_0"):
             put(tmp_path / "training" / folder / f"{i:06}_10.png", np.ones((2, 3), np.uint16))
     return tmp_path
-
-
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Streets that only tell what was asked of them."""
-    module = SimpleNamespace(Streets=lambda count, seed, size: (count, seed, size))
-    monkeypatch.setitem(sys.modules, "rts2.model.data.streets", module)
 
 
 def test_rows_name_splits_that_they_have() -> None:
@@ -66,7 +59,7 @@ def test_list_file_chooses_frames(kitti: Path, tmp_path: Path) -> None:
         open_dataset("kitti2015", kitti, path)
 
 
-def test_wrong_requests_are_one_line(kitti: Path, made: None) -> None:
+def test_wrong_requests_are_one_line(kitti: Path) -> None:
     with pytest.raises(UsageError, match=r"one of kitti2015, .*streets, not 'kiti'"):
         open_dataset("kiti", kitti)
     with pytest.raises(UsageError, match=r"kitti2015 needs its folder .* --data DIR"):
@@ -79,13 +72,30 @@ def test_wrong_requests_are_one_line(kitti: Path, made: None) -> None:
         open_dataset("streets", kitti)
 
 
-def test_streets_that_judge_never_train(made: None) -> None:
+def test_streets_that_judge_never_train() -> None:
+    def told(**how: Any) -> tuple[int, int, tuple[int, int]]:
+        found = open_dataset("streets", **how)
+        assert isinstance(found, Streets)
+        return len(found), found.seed, found.size
+
     size = (512, 256)
-    assert open_dataset("streets", split="train", count=7, seed=3, size=size) == (7, 3, size)
-    assert open_dataset("streets", split="val", count=7, seed=3) == (7, VAL_SEED, (1242, 375))
-    assert open_dataset("streets") == (200, VAL_SEED, (1242, 375))
+    assert told(split="train", count=7, seed=3, size=size) == (7, 3, size)
+    assert told(split="val", count=7, seed=3) == (7, VAL_SEED, (1242, 375))
+    assert told() == (200, VAL_SEED, (1242, 375))
     with pytest.raises(UsageError, match="belongs to the streets that judge"):
-        open_dataset("streets", split="train", seed=VAL_SEED)
+        told(split="train", seed=VAL_SEED)
+
+
+@pytest.mark.parametrize("count", [0, -1, 10**20])
+def test_streets_have_a_count_that_can_be_made(count: int) -> None:
+    with pytest.raises(UsageError, match=f"streets may be 1 to 1000000, not {count}"):
+        open_dataset("streets", count=count)
+
+
+def test_streets_may_be_rectified_badly() -> None:
+    found = open_dataset("streets", count=1, rectification_px=0.5)
+    assert isinstance(found, Streets)
+    assert found.look.rectification_px == 0.5
 
 
 def test_streets_are_cached_like_the_rest(tmp_path: Path) -> None:

@@ -113,3 +113,11 @@ def test_empty_folders_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     with pytest.raises(UsageError, match=r"needs images .*left; none is there, found nothing"):
         open_all(tmp_path)
+
+
+def test_an_empty_array_is_a_map_of_another_size(pairs: Path) -> None:
+    (pairs / "disparity").mkdir()
+    for name in ("a", "b.1"):
+        np.save(pairs / "disparity" / f"{name}.npy", np.zeros((0, 0), np.float32))
+    with pytest.raises(Rts2Error, match="truth 0x0"):
+        open_all(pairs)[0].read()

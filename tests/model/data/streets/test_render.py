@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rts2.model.data.streets import paint, render, shapes
-from rts2.model.data.streets.layout import Soup
 from rts2.model.data.streets.render import Camera, Light, World
+from rts2.model.data.streets.soup import Soup
 
 CAMERA = Camera(focal_px=100.0, centre=(31.5, 15.5), size=(64, 32), baseline_m=0.5)
 LEFT, RIGHT = np.zeros(3), np.array([0.5, 0, 0])
