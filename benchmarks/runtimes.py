@@ -12,7 +12,7 @@ import torch
 from rts2.model.arch import UNTRAINED, Arch
 from rts2.model.checkpoint import build
 from rts2.model.export import Deployed, export
-from rts2.profiles.measure import cores
+from rts2.model.machine import cores
 from rts2.profiles.runtimes.ort import Session
 from rts2.profiles.timing import measure
 

@@ -67,7 +67,7 @@ def load(path: Path) -> tuple[Network, Header]:
     # A safetensors file starts with the length of its header, which may look like either mark.
     pickled = head[:2] in (b"PK", b"\x80\x02") and head[8:] != b"{"
     network, header = _import_anynet(path) if pickled else _load_own(path)
-    broken = [name for name, value in network.state_dict().items() if not _finite(value)]
+    broken = not_finite(network)
     if broken:
         raise Rts2Error(f"{path}: {broken[0]} holds values that are not finite; train it again")
     return network, header
@@ -92,8 +92,13 @@ def parameters(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def _finite(value: Tensor) -> bool:
-    return not value.is_floating_point() or bool(value.isfinite().all())
+def not_finite(network: nn.Module) -> list[str]:
+    """The names of the tensors that hold a NaN or an infinity."""
+    return [
+        name
+        for name, value in network.state_dict().items()
+        if value.is_floating_point() and not value.isfinite().all()
+    ]
 
 
 def read_header(path: Path) -> Header:

@@ -71,8 +71,11 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Command:
             _silence_stdout()
             return 0
         except OSError as error:
+            reason = error.strerror or error
+            if error.filename is not None:
+                return _failed(f"cannot read or write {error.filename}: {reason}", 1)
             _silence_stdout()
-            return _failed(f"cannot write the result: {error.strerror or error}", 1)
+            return _failed(f"cannot write the result: {reason}", 1)
         return code
 
     return guarded

@@ -212,7 +212,8 @@ def _check(options: argparse.Namespace) -> None:
 
 def _bench(options: argparse.Namespace, known: Profile) -> Bench:
     """A bench on this machine, if the profile is one of a machine at hand."""
-    from .measure import Bench, cores, this_machine
+    from ..model.machine import cores
+    from .measure import Bench, this_machine
 
     if known.machine is None:
         raise UsageError(
@@ -257,8 +258,9 @@ def _fit(options: argparse.Namespace) -> None:
 
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:
     """Times networks until the budget is spent, going on where an earlier run stopped."""
+    from ..model.machine import cores
     from .calibrate import FORMS
-    from .measure import Bench, candidates, cores, extend, open_journal, profile_of
+    from .measure import Bench, candidates, extend, open_journal, profile_of
 
     threads = options.threads or cores()
     journal_path = path.with_name(f"{path.stem}.timings.json")
@@ -297,7 +299,8 @@ def _until(deadline: float, items: Any, journal: Journal) -> Any:
 
 def _measure(options: argparse.Namespace) -> None:
     from ..model.files import existing_file
-    from .measure import Bench, cores, this_machine
+    from ..model.machine import cores
+    from .measure import Bench, this_machine
 
     threads = options.threads or cores()
     paths = [existing_file(path, "an ONNX file") for path in options.models]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import random
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ..model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, UNTRAINED, Arch
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
+from ..model.machine import processor
 from .calibrate import FORMS, calibrated
 from .profile import Fact, Machine, Point, Profile, Resolution
 from .timing import Timing, measure
@@ -209,27 +209,9 @@ def this_machine(threads: int) -> Machine:
 
     own = {"rts2": version("rts2"), "python": platform.python_version()}
     return Machine(
-        processor=_processor(),
+        processor=processor(),
         threads=threads,
         system=f"{platform.system()} {platform.machine()}",
         versions=own | ort.versions(),
         date=date.today().isoformat(),
     )
-
-
-def cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _processor() -> str:
-    """The processor's name and, where the system tells them, its family and model."""
-    known: dict[str, str] = {}
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
-            name, _, value = line.partition(":")
-            known.setdefault(name.strip(), value.strip())
-    title = known.get("model name") or platform.processor() or platform.machine()
-    family, model = known.get("cpu family"), known.get("model")
-    return f"{title}, family {family}, model {model}" if family and model else title

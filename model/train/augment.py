@@ -37,10 +37,17 @@ def augmented(scene: Scene, how: Augmentation, rng: np.random.Generator) -> Scen
     shared = rng.uniform(-1, 1, 5)
     level = rng.uniform(0, how.noise)
     left, right = (
-        _recoloured(image, how, (shared + how.apart * rng.uniform(-1, 1, 5)), level, rng)
+        _recoloured(image, how, _nearby(shared, how.apart, rng), level, rng)
         for image in (scene.left, scene.right)
     )
     return replace(scene, left=left, right=right)
+
+
+def _nearby(
+    shared: NDArray[np.float64], apart: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """One eye's draw: up to `apart` from what both share, and no further from 0 than 1."""
+    return np.clip(shared + apart * rng.uniform(-1, 1, shared.size), -1, 1)
 
 
 def _recoloured(

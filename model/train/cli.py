@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import sleep
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from ..arch import Arch, arch_from
 from ..box import SHIPPED, named_model
@@ -16,6 +16,7 @@ from ..console import add_output, command, parser, positive, print_json, progres
 from ..data.catalog import DATASETS
 from ..errors import Rts2Error, UsageError
 from ..files import existing_file, parse_json, read_json, sha256
+from ..machine import cores
 from .recipe import PRESETS, Recipe, recipe_from
 
 if TYPE_CHECKING:
@@ -33,41 +34,68 @@ BRANCHES = {
 
 
 TELLING_SECONDS = 2
-"""How long the other processes outlive an error: torchrun ends all once one has ended, and the
-first one is to tell why."""
+"""How long a process keeps quiet about an error that another one may tell: torchrun ends all once
+one has ended."""
+
+MOST: Final = 1_000_000
+"""The largest count that an option takes."""
+
+MOST_THREADS: Final = 1024
+"""So many threads or processes no machine runs well."""
 
 
 @command
 def train(arguments: Sequence[str] | None = None) -> int:
     """The command rts2-train: weights from a data set and a recipe."""
     options = _parser().parse_args(arguments)
-    options.init = None if options.init is None else named_model(options.init)
-    recipe = _recipe(options)
-    from .distributed import join, leave, require_divides, world_of_environment
+    if "WORLD_SIZE" in os.environ:  # where processes do not meet, torch prints its own stack
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
+    from .distributed import leave, world_of_environment
 
     world = world_of_environment()
     try:
-        require_divides(world, recipe.batch, recipe.accumulate)
-        setting = _setting(options, world)
-        join(world, setting.device)
-        finished = _run(options, recipe, setting)
+        _trained(options, world)
     except Rts2Error as error:
-        if world.first:
-            raise
-        sleep(TELLING_SECONDS)
-        return error.exit_code
+        return _ended(error, world)
     finally:
         leave(world)
+    return 0
+
+
+def _trained(options: argparse.Namespace, world: World) -> None:
+    from .distributed import join, require_divides
+
+    options.init = None if options.init is None else named_model(options.init)
+    recipe = _recipe(options)
+    require_divides(world, recipe.batch, recipe.accumulate)
+    setting = _setting(options, world)
+    join(world, setting.device)
+    finished = _run(options, recipe, setting)
     if world.first:
         _report(options, recipe, finished)
-    return 0
+
+
+def _ended(error: Rts2Error, world: World) -> int:
+    """Tells an error of one process among several, or leaves that to the one that knows better."""
+    from .distributed import Everywhere, Lost
+
+    if world.first and not isinstance(error, Lost):
+        raise error
+    sleep(TELLING_SECONDS)
+    if isinstance(error, Everywhere):
+        return error.exit_code  # the first process tells it
+    if isinstance(error, Lost):
+        raise error
+    raise type(error)(f"process {world.rank}: {error}") from error
 
 
 def _run(options: argparse.Namespace, recipe: Recipe, setting: Setting) -> Finished:
     from .run import run
     from .source import cached, open_samples
 
-    samples = cached(open_samples(recipe, options.data), options.cache)
+    samples = setting.world.together(
+        lambda: cached(open_samples(recipe, options.data), options.cache)
+    )
     return run(recipe, samples, lambda: _start(options, recipe), setting)
 
 
@@ -83,14 +111,14 @@ def _setting(options: argparse.Namespace, world: World) -> Setting:
 
     from .run import Setting
 
-    cores = max(1, _cores() // world.local_size)
-    torch.set_num_threads(options.threads or cores)
+    own = max(1, cores() // world.local_size)
+    torch.set_num_threads(options.threads or own)
     device = _device(options.on, world.local)
     return Setting(
         out=options.out,
         device=device,
         world=world,
-        workers=_workers(device, cores) if options.workers is None else options.workers,
+        workers=_workers(device, own) if options.workers is None else options.workers,
         checkpoint_every=options.checkpoint_every,
         picture_every=options.picture_every,
         shown=_shown if world.first else lambda items, _title, _total: items,
@@ -106,22 +134,22 @@ def _device(on: str, local: int) -> torch.device:
 
     if on == "cpu" or (on == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
-    if local >= torch.cuda.device_count():
-        raise UsageError(
+    count = torch.cuda.device_count()
+    if local >= count:
+        from .distributed import Everywhere
+
+        error = UsageError(
             f"every process needs a GPU of its own: process {local} of this machine finds "
-            f"{torch.cuda.device_count()}; start fewer, or give --on cpu"
+            f"{count}; start fewer, or give --on cpu"
         )
+        raise error if local == count else Everywhere(error)
     torch.cuda.set_device(local)
     return torch.device("cuda", local)
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _workers(device: torch.device, cores: int) -> int:
-    """A GPU leaves the cores to the loader; on a CPU they train."""
-    return min(cores, 16) if device.type == "cuda" else max(1, cores // 4)
+def _workers(device: torch.device, own: int) -> int:
+    """A GPU leaves a process's own cores to the loader; on a CPU they train."""
+    return min(own, 16) if device.type == "cuda" else max(1, own // 4)
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
@@ -137,9 +165,7 @@ def _recipe(options: argparse.Namespace) -> Recipe:
         raise UsageError("what to learn from is needed: give --preset or --dataset")
     if "epochs" not in values and "steps" not in values:
         raise UsageError("how long to train is needed: give --epochs or --steps")
-    values.setdefault("k", DATASETS[values["dataset"]].k)
-    if values["k"] == 0:
-        values["k"] = None
+    values |= _of_dataset(values, given)
     own = {n: getattr(options, n) for n in COLOURS if getattr(options, n) is not None}
     values["augmentation"] = values.get("augmentation", {}) | own
     values["arch"] = _arch(options, values.get("arch"))
@@ -148,6 +174,21 @@ def _recipe(options: argparse.Namespace) -> Recipe:
     if options.crop is not None:
         values["crop"] = options.crop[::-1]
     return recipe_from(values)
+
+
+def _of_dataset(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """What the data set decides: its k, unless told, and whether its scenes can be counted out."""
+    row = DATASETS[values["dataset"]]
+    found: dict[str, Any] = {"k": values.get("k", row.k) or None}
+    if not row.has_folder:
+        return found
+    for name in ("count", "data_seed"):
+        if name in given:
+            raise UsageError(
+                f"--{name.replace('_', '-')} chooses among generated scenes, and "
+                f"{values['dataset']} lies in a folder; leave it out, or give --split a list"
+            )
+    return found | {"count": None}  # the preset's, where it is of generated scenes
 
 
 def _arch(options: argparse.Namespace, preset: dict[str, Any] | None) -> Arch:
@@ -288,21 +329,33 @@ def _add_colours(command: argparse.ArgumentParser) -> None:
 def _add_setting(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("machine (changes no result)")
     group.add_argument("--on", choices=("auto", "cpu", "cuda"), default="auto")
-    group.add_argument("--workers", type=_count, metavar="N", help="processes that load")
-    group.add_argument("--threads", type=_whole, metavar="N", help="of torch (default: all cores)")
+    group.add_argument("--workers", type=_workers_given, metavar="N", help="processes that load")
+    group.add_argument(
+        "--threads", type=_threads, metavar="N", help="of torch (default: all cores)"
+    )
     group.add_argument("--checkpoint-every", type=_whole, default=500, metavar="STEPS")
     group.add_argument("--picture-every", type=_whole, default=500, metavar="STEPS")
 
 
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit()):
-        raise argparse.ArgumentTypeError(f"must be a whole number of 0 or more, not {text!r}")
-    return int(text)
-
-
 def _whole(text: str) -> int:
-    if _count(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of 1 or more, not {text!r}")
+    return _between(text, 1, MOST)
+
+
+def _threads(text: str) -> int:
+    return _between(text, 1, MOST_THREADS)
+
+
+def _workers_given(text: str) -> int:
+    return _between(text, 0, MOST_THREADS)
+
+
+def _between(text: str, least: int, most: int) -> int:
+    """A whole number, as an option type."""
+    digits = text.isascii() and text.isdigit() and len(text) <= 20
+    if not (digits and least <= int(text) <= most):
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from {least} to {most}, not {text!r}"
+        )
     return int(text)
 
 

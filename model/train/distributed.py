@@ -8,15 +8,36 @@ weights go by the same names as those of the norm that it stands for.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from datetime import timedelta
+from textwrap import shorten
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
 
-from ..errors import UsageError
+from ..errors import Rts2Error, UsageError
+
+Found = TypeVar("Found")
+
+MEETING_SECONDS = 120
+"""How long a process waits for the first one at the start; torchrun starts them together."""
+
+
+class Everywhere(Rts2Error):
+    """An error that every process raises at once, so that one of them may tell it for all."""
+
+    def __init__(self, error: Rts2Error, text: str | None = None) -> None:
+        super().__init__(str(error) if text is None else text)
+        self.exit_code = error.exit_code
+
+
+class Lost(Rts2Error):
+    """Another process has ended, which mostly tells why by itself."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +60,9 @@ class World:
         """Each number summed over all processes."""
         if self.size == 1:
             return list(numbers)
-        summed = torch.tensor(numbers, dtype=torch.int64, device=_device())
-        dist.all_reduce(summed)
+        with self._meeting():
+            summed = torch.tensor(numbers, dtype=torch.int64, device=_device())
+            dist.all_reduce(summed)
         return [int(number) for number in summed]
 
     def add(self, tensors: Sequence[Tensor]) -> None:
@@ -48,7 +70,8 @@ class World:
         if self.size == 1 or not tensors:
             return
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
-        dist.all_reduce(flat)
+        with self._meeting():
+            dist.all_reduce(flat)
         parts = torch.split(flat, [tensor.numel() for tensor in tensors])
         for tensor, part in zip(tensors, parts, strict=True):
             tensor.copy_(part.view(tensor.shape))
@@ -58,8 +81,49 @@ class World:
         if self.size == 1:
             return [value]
         values: list[Any] = [None] * self.size
-        dist.all_gather_object(values, value)
+        with self._meeting():
+            dist.all_gather_object(values, value)
         return values
+
+    def together(self, work: Callable[[], Found]) -> Found:
+        """What `work` gives; where it fails in one process, all of them raise its error.
+
+        `work` must not meet the other processes. Where not all fail alike, the error names the
+        first process that did.
+        """
+        if self.size == 1:
+            return work()
+        found: list[Found] = []
+        own: Rts2Error | None = None
+        try:
+            found.append(work())
+        except Rts2Error as error:
+            own = error
+        every = self.gathered(own)
+        failed = [rank for rank, error in enumerate(every) if error is not None]
+        if failed:
+            first: Rts2Error = every[failed[0]]
+            alike = all(str(error) == str(first) for error in every)
+            raise Everywhere(first, None if alike else f"process {failed[0]}: {first}") from own
+        return found[0]
+
+    def everywhere(self, error: Rts2Error) -> Rts2Error:
+        """`error`, marked as one that every process raises."""
+        return error if self.size == 1 else Everywhere(error)
+
+    def lost(self, error: RuntimeError) -> Lost:
+        """What torch raises where another process is gone, in one line of ours."""
+        return Lost(f"process {self.rank} lost the others ({shorten(first_line(error), 160)})")
+
+    @contextmanager
+    def _meeting(self) -> Iterator[None]:
+        """Turns what torch raises where another process is gone into a `Lost`."""
+        try:
+            yield
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            raise self.lost(error) from error
 
 
 def world_of_environment() -> World:
@@ -80,16 +144,32 @@ def require_divides(world: World, batch: int, accumulate: int) -> None:
     if micro % world.size:
         fitting = ", ".join(str(size) for size in range(1, micro + 1) if micro % size == 0)
         cut = f" (a batch of {batch} in {accumulate} micro-batches)" if accumulate > 1 else ""
-        raise UsageError(
-            f"the batch must divide among the processes: {micro} samples{cut} "
-            f"among {world.size}; start one of {fitting} processes, or change --batch"
+        raise world.everywhere(
+            UsageError(
+                f"the batch must divide among the processes: {micro} samples{cut} "
+                f"among {world.size}; start one of {fitting} processes, or change --batch"
+            )
         )
 
 
 def join(world: World, device: torch.device) -> None:
-    """Meets the other processes: over NCCL where they have a GPU each, else over Gloo."""
-    if world.size > 1:
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    """Meets the other processes: over NCCL where they have a GPU each, else over Gloo.
+
+    Raises `UsageError` where nothing says where to meet, or nobody is there.
+    """
+    if world.size == 1:
+        return
+    backend = "nccl" if device.type == "cuda" else "gloo"
+    try:
+        patience = timedelta(seconds=MEETING_SECONDS)
+        store, *_ = next(rendezvous("env://", world.rank, world.size, timeout=patience))
+        store.set_timeout(dist.default_pg_timeout)
+        dist.init_process_group(backend, store=store, rank=world.rank, world_size=world.size)
+    except (ValueError, RuntimeError, OSError) as error:
+        raise UsageError(
+            f"the processes cannot meet: {first_line(error).rstrip('.')}; start them with "
+            "torchrun, which says where (MASTER_ADDR, MASTER_PORT)"
+        ) from error
 
 
 def leave(world: World) -> None:
@@ -169,6 +249,11 @@ def _total(values: Tensor) -> Tensor:
     """`values` summed over all processes, differentiably."""
     summed: Tensor = _Sum.apply(values)  # type: ignore[no-untyped-call]  # torch's own
     return summed
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text: torch adds the stack of its own sources."""
+    return str(error).strip().partition("\n")[0]
 
 
 def _device() -> torch.device:

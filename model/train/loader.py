@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -25,6 +25,12 @@ from ..losses import Truth
 from ..metrics import IGNORED
 from .augment import augmented, crop
 from .recipe import Recipe
+
+PREFETCHED: Final = 4
+"""How many batches a worker has ready at most."""
+
+SMALLER: Final = "give a larger --accumulate, or a smaller --batch or --crop, in another --out"
+"""What helps where memory is short."""
 
 ORDER, SCENE = 0, 1
 """What a generator is for: its seed ends in one of these."""
@@ -114,10 +120,24 @@ class Prepared(Dataset[Any]):
             rng = np.random.default_rng([self.recipe.seed, epoch, index, SCENE])
             scene = checked(self.samples[index].read(), self.recipe)
             return augmented(crop(scene, self.recipe.crop, rng), self.recipe.augmentation, rng)
-        except Rts2Error as error:
-            return Fault(str(error), isinstance(error, UsageError))
-        except OSError as error:
-            return Fault(f"cannot read {self.samples[index].name}: {error}", False)
+        except (Rts2Error, OSError, MemoryError) as error:
+            return fault(error, self.samples[index].name)
+
+
+def fault(error: Rts2Error | OSError | MemoryError, name: str) -> Fault:
+    """What kept the sample `name` from being read, in one line."""
+    if isinstance(error, Rts2Error):
+        return Fault(str(error), isinstance(error, UsageError))
+    if isinstance(error, MemoryError):
+        return Fault(f"{name} does not fit in memory; give a smaller --crop ({error})", False)
+    return Fault(f"cannot read {name}: {error}", False)
+
+
+def ended(error: RuntimeError | MemoryError) -> Fault:
+    """What a worker's end means, in one line."""
+    if isinstance(error, MemoryError):
+        return Fault(f"the next batch does not fit in memory; {SMALLER} ({error})", False)
+    return Fault(f"a worker of the loader ended: {error}; try --workers 0", False)
 
 
 def checked(scene: Scene, recipe: Recipe) -> Scene:
@@ -155,6 +175,13 @@ def collated(scenes: Sequence[Scene | Fault]) -> Batch | Fault:
         if isinstance(scene, Fault):
             return scene
     whole = [scene for scene in scenes if isinstance(scene, Scene)]
+    try:
+        return _batch(whole)
+    except MemoryError as error:
+        return Fault(f"a batch of {len(whole)} does not fit in memory; {SMALLER} ({error})", False)
+
+
+def _batch(whole: Sequence[Scene]) -> Batch:
     labels = [scene.semantic for scene in whole if scene.semantic is not None]
     return Batch(
         [scene.name for scene in whole],
@@ -179,7 +206,7 @@ def loader(
         collate_fn=collated,
         worker_init_fn=one_thread,
         pin_memory=pin,
-        prefetch_factor=4 if workers else None,
+        prefetch_factor=PREFETCHED if workers else None,
         generator=torch.Generator(),  # of the workers' seeds, which nothing here uses
     )
 

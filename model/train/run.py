@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import platform
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
@@ -18,17 +17,18 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from ..arch import UNTRAINED
-from ..checkpoint import Network, build, save
+from ..checkpoint import Network, build, not_finite, save
 from ..data.scene import Sample
 from ..errors import Rts2Error, UsageError
 from ..files import output_folder, write_json
-from .distributed import World
-from .loader import Batch, Fault, Places, loader
+from ..machine import processor
+from .distributed import Lost, World, first_line
+from .loader import SMALLER, Batch, Fault, Places, ended, loader
 from .log import Log, Row, read_log
 from .monitor import Monitor
 from .precision import Resolved, resolve
 from .recipe import Recipe
-from .source import Shown, class_shares, names_digest
+from .source import Shown, class_shares, digest, fingerprint
 from .state import Standing, read_standing, restore, save_state
 from .trainer import Outcome, Trainer, term_names
 
@@ -37,6 +37,9 @@ CHECKPOINT: Final = "checkpoint.safetensors"
 LOG: Final = "log.csv"
 RECORD: Final = "record.json"
 """The files of a run."""
+
+COMPUTING: Final = ("rts2", "torch", "numpy", "opencv-python-headless", "embreex")
+"""The packages whose versions may decide a bit of the weights."""
 
 TENTHS: Final = 10
 """Into how many parts the record's summary of the log is cut."""
@@ -94,24 +97,30 @@ class Run:
         self.world = setting.world
         self.precision = resolve(recipe.precision, setting.device)
         self.steps = recipe.total_steps(len(samples))
-        self.digest = names_digest(samples)
+        self.digest = digest(samples)
         self.state = setting.out / STATE
-        standing = self._standing()
+        standing = self.world.together(self._standing)
         self._agree(standing)
+        if standing is None or standing.step < self.steps:
+            self.world.together(self._require_writable)
         self.shares = self._shares(standing)
-        network = build(recipe.arch) if standing else start()
+        network = build(recipe.arch) if standing else self.world.together(start)
         self.trainer = Trainer(
             network, recipe, self.precision, setting.device, self.world, self.shares
         )
         self.done, self.seconds = 0, 0.0
+        self.kept: int | None = None
         if standing is not None:
-            self._resume(standing)
+            self.world.together(lambda: self._resume(standing))
         self.resumed_at = self.done
 
     def finish(self) -> Finished:
         """Takes every step that is left."""
-        if self.done < self.steps:
-            self._train()
+        try:
+            if self.done < self.steps:
+                self._train()
+        except Lost as error:
+            raise Lost(f"step {self.done + 1}: {error}; {self._kept()}") from error
         return Finished(
             self.done,
             self.resumed_at,
@@ -123,9 +132,12 @@ class Run:
     def _standing(self) -> Standing | None:
         """Where the run in the folder stands; `UsageError` where it is another run."""
         out = self.setting.out
-        if not self.state.exists():
-            if (out / CHECKPOINT).exists():
-                raise UsageError(f"{out} holds a checkpoint without its run; choose another --out")
+        if not self.state.exists():  # which a run writes first
+            for name in (CHECKPOINT, LOG, RECORD):
+                if (out / name).exists():
+                    raise UsageError(
+                        f"{out} holds {name} without its run ({STATE}); choose another --out"
+                    )
             return None
         found = read_standing(self.state)
         differences = self.recipe.differences(found.recipe)
@@ -134,7 +146,7 @@ class Run:
                 f"the data set has {found.samples} samples there, {len(self.samples)} here"
             )
         elif found.digest != self.digest:
-            differences.append("the samples have other names")
+            differences.append("the samples have other names, or another generator made them")
         if differences:
             raise UsageError(
                 f"{out} holds another run: {'; '.join(differences)}; "
@@ -148,11 +160,29 @@ class Run:
         views = self.world.gathered((step, len(self.samples), self.digest))
         for rank, view in enumerate(views):
             if view != views[0]:
-                raise Rts2Error(
-                    f"every machine must see the same --data and --out: process {rank} finds "
-                    f"{view[1]} samples and step {view[0]}, process 0 {views[0][1]} and "
-                    f"{views[0][0]}; share the folders"
+                raise self.world.everywhere(
+                    Rts2Error(
+                        f"every machine must see the same --data and --out: process {rank} finds "
+                        f"{view[1]} samples and step {view[0]}, process 0 {views[0][1]} and "
+                        f"{views[0][0]}; share the folders"
+                    )
                 )
+
+    def _require_writable(self) -> None:
+        """Knows early whether results can be written; leaves no folder, as other faults may come.
+
+        Raises `Rts2Error` where they cannot.
+        """
+        out = self.setting.out
+        if not self.world.first:
+            return
+        missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+        try:
+            output_folder(out)
+        finally:
+            for folder in missing:
+                with suppress(OSError):
+                    folder.rmdir()
 
     def _shares(self, standing: Standing | None) -> NDArray[np.float64] | None:
         """The classes' shares, counted once in a run's life."""
@@ -169,14 +199,18 @@ class Run:
         if standing.scaler is not None:
             self.trainer.scaler.load_state_dict(dict(standing.scaler))
         self.done, self.seconds = standing.step, standing.seconds
+        self.kept = standing.step
 
     def _train(self) -> None:
         if not self.world.first:
             for _ in self._stepped():
-                pass
+                if self._due(self.setting.checkpoint_every):
+                    self.kept = self.done
             return
         out = output_folder(self.setting.out)
         output_folder(out / "pictures")
+        if not self.state.exists():
+            self._save_state()  # first of all: what else lies there is then known as ours
         with (
             closing(Log(out / LOG, term_names(self.recipe), self.done)) as log,
             closing(Monitor(out, self.steps, self.done)) as monitor,
@@ -217,19 +251,18 @@ class Run:
         """One step; whatever ends it becomes one line."""
         try:
             return self.trainer.step(micros, rate)
-        except Rts2Error as error:
-            raise Rts2Error(f"step {self.done + 1}: {error}; {self._kept()}") from error
-        except RuntimeError as error:
-            if "memory" in str(error):
+        except Lost:
+            raise
+        except Rts2Error as error:  # found in what all processes share
+            told = Rts2Error(f"step {self.done + 1}: {error}; {self._kept()}")
+            raise self.world.everywhere(told) from error
+        except (RuntimeError, MemoryError) as error:
+            if isinstance(error, MemoryError) or "memory" in str(error):
                 raise Rts2Error(
-                    f"step {self.done + 1} does not fit in memory; give a larger --accumulate or "
-                    f"a smaller --batch in another --out ({_first_line(error)})"
+                    f"step {self.done + 1} does not fit in memory; {SMALLER} ({first_line(error)})"
                 ) from error
             if self.world.size > 1:
-                raise Rts2Error(
-                    f"process {self.world.rank} lost the others in step {self.done + 1} "
-                    f"({_first_line(error)}); {self._kept()}"
-                ) from error
+                raise self.world.lost(error) from error
             raise
 
     def _fetched(self, batches: Iterator[Batch | Fault]) -> list[Batch]:
@@ -237,25 +270,41 @@ class Run:
         found: list[Batch | Fault] = []
         try:
             found += [next(batches) for _ in range(self.recipe.accumulate)]
-        except RuntimeError as error:  # a worker was killed
-            found.append(Fault(f"a worker of the loader ended: {error}; try --workers 0", False))
+        except (RuntimeError, MemoryError) as error:  # a worker was killed
+            found.append(ended(error))
         faults = [fault for fault in found if isinstance(fault, Fault)]
         if self.world.total([len(faults)])[0]:
             told = [fault for part in self.world.gathered(faults) for fault in part]
-            raise told[0].error()
+            raise self.world.everywhere(told[0].error())
         return [batch for batch in found if isinstance(batch, Batch)]
 
     def _kept(self) -> str:
-        every = self.setting.checkpoint_every
-        return f"the checkpoint of step {self.done // every * every} is kept"
+        """What is left on the disk, in words."""
+        if self.kept is None:
+            return "no checkpoint was written yet"
+        return f"the checkpoint of step {self.kept} is kept"
 
     def _keep(self, log: Log) -> None:
         """Writes where the run stands: the state last, as it is what a run resumes from."""
-        out, trainer = self.setting.out, self.trainer
-        broken = [n for n, v in trainer.network.state_dict().items() if not _finite(v)]
+        out, network = self.setting.out, self.trainer.network
+        broken = not_finite(network)
         if broken:
-            raise Rts2Error(f"{broken[0]} is not finite after step {self.done}; it is not saved")
+            raise Rts2Error(
+                f"{broken[0]} is not finite after step {self.done}; it is not saved; {self._kept()}"
+            )
         log.sync()
+        rows = read_log(out / LOG)
+        try:
+            save(network, out / CHECKPOINT, self._origin(rows))
+        except SafetensorError as error:
+            raise Rts2Error(f"cannot write {out / CHECKPOINT}: {error}; {self._kept()}") from error
+        self.kept = self.done
+        write_json(out / RECORD, self._record(rows))
+        self._save_state()
+
+    def _save_state(self) -> None:
+        """Writes what a run resumes from."""
+        trainer = self.trainer
         scaler = trainer.scaler.state_dict() or None
         standing = Standing(
             recipe=self.recipe,
@@ -267,13 +316,7 @@ class Run:
             scaler=scaler,
             seconds=self.seconds,
         )
-        rows = read_log(out / LOG)
-        try:
-            save(trainer.network, out / CHECKPOINT, self._origin(rows))
-            write_json(out / RECORD, self._record(rows))
-            save_state(self.state, standing, trainer.network, trainer.optimizer)
-        except SafetensorError as error:
-            raise Rts2Error(f"cannot write {out / CHECKPOINT}: {error}; {self._kept()}") from error
+        save_state(self.state, standing, trainer.network, trainer.optimizer)
 
     def _origin(self, rows: Sequence[Row]) -> str:
         """How the weights came to be, in a sentence."""
@@ -295,16 +338,14 @@ class Run:
             "precision": self.precision,
             "processes": self.world.size,
             "samples": len(self.samples),
+            "data": fingerprint(self.samples),
             "steps": self.done,
             "steps_planned": self.steps,
             "images": self.done * self.recipe.batch,
             "seconds": self.seconds,
             "class_shares": None if self.shares is None else self.shares.tolist(),
             "log": summary(rows),
-            "versions": {
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("rts2", "torch", "numpy")},
-            },
+            "versions": _versions(),
             "machine": {
                 "system": platform.platform(),
                 "processor": machine(self.setting.device),
@@ -328,17 +369,13 @@ def summary(rows: Sequence[Row]) -> list[Row]:
 
 def machine(device: torch.device) -> str:
     """The name of what computes."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    known = Path("/proc/cpuinfo")
-    lines = known.read_text().splitlines() if sys.platform == "linux" and known.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else processor()
 
 
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0]
-
-
-def _finite(value: torch.Tensor) -> bool:
-    return not value.is_floating_point() or bool(value.isfinite().all())
+def _versions() -> dict[str, str]:
+    """What computes, as far as it is installed."""
+    found = {"python": platform.python_version()}
+    for name in COMPUTING:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -15,19 +15,29 @@ from torch.utils.data import DataLoader, Dataset
 from ..data.cache import Cached
 from ..data.catalog import DATASETS, open_dataset
 from ..data.scene import Sample
-from ..errors import Rts2Error, UsageError
+from ..errors import Rts2Error
 from ..metrics import IGNORED
 from .distributed import World
-from .loader import Fault, one_thread, require_labels
+from .loader import Fault, ended, fault, one_thread, require_labels
 from .recipe import Recipe
 
 Shown = Callable[[Iterable[Any], str, int], Iterable[Any]]
 """Passes items on and shows how far they are: (items, title, total)."""
 
 
-def names_digest(samples: Sequence[Sample]) -> str:
-    """The SHA-256 of all names in their order."""
-    return hashlib.sha256("\n".join(sample.name for sample in samples).encode()).hexdigest()
+def fingerprint(samples: Sequence[Sample]) -> str | None:
+    """What a generator says of itself; None for files, which are known by their names.
+
+    The fingerprint of a file is where it lies and when it was written, which may change.
+    """
+    told = getattr(samples.samples if isinstance(samples, Cached) else samples, "fingerprint", None)
+    return None if told is None else str(told)
+
+
+def digest(samples: Sequence[Sample]) -> str:
+    """The SHA-256 of all names in their order, after the generator's fingerprint."""
+    lines = [fingerprint(samples) or "", *(sample.name for sample in samples)]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 class LabelCounts(Dataset[Any]):
@@ -40,12 +50,11 @@ class LabelCounts(Dataset[Any]):
         return len(self.chosen)
 
     def __getitem__(self, place: int) -> NDArray[np.int64] | Fault:
+        sample = self.samples[self.chosen[place]]
         try:
-            labels = require_labels(self.samples[self.chosen[place]].read(), self.classes)
-        except Rts2Error as error:
-            return Fault(str(error), isinstance(error, UsageError))
-        except OSError as error:
-            return Fault(f"cannot read {self.samples[self.chosen[place]].name}: {error}", False)
+            labels = require_labels(sample.read(), self.classes)
+        except (Rts2Error, OSError, MemoryError) as error:
+            return fault(error, sample.name)
         return np.bincount(labels[labels != IGNORED], minlength=self.classes).astype(np.int64)
 
 
@@ -58,27 +67,38 @@ def class_shares(
     """
     wanted = min(recipe.counted, len(samples))
     chosen = [place * len(samples) // wanted for place in range(wanted)]
-    mine = chosen[world.rank :: world.size]
-    counted = DataLoader(
-        LabelCounts(samples, mine, recipe.arch.classes),
+    mine = LabelCounts(samples, chosen[world.rank :: world.size], recipe.arch.classes)
+    own = world.together(lambda: _counted(mine, workers, shown))
+    pixels = np.array(world.total(own.tolist()))
+    if not pixels.any():
+        raise world.everywhere(
+            Rts2Error(
+                f"the semantic branch learns from labels: {wanted} samples have no labelled "
+                "pixel; train --branches disparity"
+            )
+        )
+    shares: NDArray[np.float64] = pixels / pixels.sum()
+    return shares
+
+
+def _counted(counts: LabelCounts, workers: int, shown: Shown) -> NDArray[np.int64]:
+    """The pixels of each class in all of the samples."""
+    loader = DataLoader(
+        counts,
         batch_size=None,
         num_workers=workers,
         worker_init_fn=one_thread,
         generator=torch.Generator(),  # of the workers' seeds, which nothing here uses
     )
-    pixels = np.zeros(recipe.arch.classes, np.int64)
-    for counts in shown(counted, "counting classes", len(mine)):
-        if isinstance(counts, Fault):
-            raise counts.error()
-        pixels += np.asarray(counts)
-    pixels = np.array(world.total(pixels.tolist()))
-    if not pixels.any():
-        raise Rts2Error(
-            f"the semantic branch learns from labels: {wanted} samples have no labelled pixel; "
-            "train --branches disparity"
-        )
-    shares: NDArray[np.float64] = pixels / pixels.sum()
-    return shares
+    pixels = np.zeros(counts.classes, np.int64)
+    try:
+        for found in shown(loader, "counting classes", len(counts)):
+            if isinstance(found, Fault):
+                raise found.error()
+            pixels += np.asarray(found)
+    except RuntimeError as error:
+        raise ended(error).error() from error
+    return pixels
 
 
 def open_samples(recipe: Recipe, folder: Path | None) -> Sequence[Sample]:

@@ -39,11 +39,11 @@ class Standing(BaseModel):
     samples: int
     """How many samples the data set has."""
     digest: str
-    """The SHA-256 of their names."""
+    """The SHA-256 of their names, and of the generator where one makes them."""
     class_shares: list[float] | None
     """Each class's share of the labelled pixels; None without class weights."""
-    scaler: dict[str, float] | None
-    """The state of the loss scaling; None where there is none."""
+    scaler: dict[str, int | float] | None
+    """The state of the loss scaling, its counts as whole numbers; None where there is none."""
     seconds: float
     """Time spent training."""
 

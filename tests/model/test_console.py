@@ -58,6 +58,30 @@ def test_ctrl_c_ends_with_130(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.endswith("interrupted\n")
 
 
+def test_a_file_that_cannot_be_read_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert ending_with(PermissionError(13, "Permission denied", "/data/left.png")) == 1
+    told = capsys.readouterr().err
+    assert told.endswith(": cannot read or write /data/left.png: Permission denied\n")
+
+
+def test_a_full_stdout_is_told_as_such() -> None:
+    script = (
+        "from rts2.model.console import command\n"
+        "@command\n"
+        "def run(arguments=None):\n"
+        "    print('x' * 100_000)\n"
+        "    return 0\n"
+        "raise SystemExit(run([]))\n"
+    )
+    with Path("/dev/full").open("wb") as full:
+        ended = subprocess.run(
+            [sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert ended.returncode == 1
+    assert ended.stderr.endswith("cannot write the result: No space left on device\n")
+    assert ended.stderr.count("\n") == 1
+
+
 def test_a_mistake_of_ours_is_not_hidden() -> None:
     with pytest.raises(ZeroDivisionError):
         ending_with(ZeroDivisionError())

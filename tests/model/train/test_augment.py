@@ -80,6 +80,18 @@ def test_gain_is_a_factor() -> None:
     assert 1.18 < max(factors) <= 1.2
 
 
+def test_no_eye_goes_beyond_the_strengths_however_far_they_are_apart() -> None:
+    image = np.full((2, 2, 3), 100, np.uint8)
+    given = Scene("s", image, image, np.zeros((2, 2), np.float32))
+    for apart in (0.5, 1.0):
+        how = Augmentation(gain=0.9, apart=apart)
+        assert apart != 0.5 or how == Augmentation(gain=0.9)  # the default
+        found = [augmented(given, how, rng(seed)) for seed in range(400)]
+        values = {int(eye[0, 0, 0]) for f in found for eye in (f.left, f.right)}
+        assert (min(values), max(values)) == (10, 190)
+        assert any(f.left[0, 0, 0] != f.right[0, 0, 0] for f in found)
+
+
 def test_upside_down_is_half_of_the_time_and_of_every_map() -> None:
     given = scene()
     found = [augmented(given, Augmentation(flip=True), rng(seed)) for seed in range(100)]

@@ -108,13 +108,13 @@ def test_a_batch_has_the_scene_s_values(pairs: Path) -> None:
 class Given:
     """A sample that reads what it was given, or fails."""
 
-    scene: Scene | OSError
+    scene: Scene | OSError | MemoryError
     name: str = "given"
     size: tuple[int, int] = (64, 32)
     foreground: None = None
 
     def read(self) -> Scene:
-        if isinstance(self.scene, OSError):
+        if not isinstance(self.scene, Scene):
             raise self.scene
         return self.scene
 
@@ -136,6 +136,7 @@ FAULTS = {
     "wrong label": (given(label=19), "0 to 18, or 255 for none: given holds 19", False),
     "too small": (given(size=(64, 31)), "64x32 does not fit in given of 64x31", True),
     "unreadable": (Given(OSError(5, "Input/output error")), "cannot read given: .*Input", False),
+    "huge": (Given(MemoryError("9 TiB")), r"given does not fit in memory; .*--crop \(9 TiB", False),
 }
 
 
@@ -150,6 +151,17 @@ def test_a_sample_that_cannot_be_learnt_from_is_named(kind: str, workers: int) -
     with pytest.raises(type(found[0].error()), match=text) as caught:
         raise found[0].error()
     assert caught.value.exit_code == (2 if usage else 1)
+
+
+def test_a_batch_that_does_not_fit_in_memory_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_arrays: object) -> None:
+        raise MemoryError("9 TiB")
+
+    monkeypatch.setattr(np, "stack", full)
+    one = recipe(batch=2, steps=1)
+    found = list(loader([given()], one, Places(one, 0, 1), 0))
+    assert [type(each) for each in found] == [Fault]
+    assert found[0].text.startswith("a batch of 2 does not fit in memory; give a larger --acc")
 
 
 def test_a_network_without_semantics_asks_for_no_labels() -> None:

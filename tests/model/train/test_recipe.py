@@ -2,9 +2,10 @@
 
 import pytest
 
+from rts2.model.arch import Arch
 from rts2.model.data.catalog import DATASETS
 from rts2.model.errors import UsageError
-from rts2.model.train.recipe import PRESETS, Recipe, recipe_from
+from rts2.model.train.recipe import PRESETS, Augmentation, Recipe, recipe_from
 
 
 def recipe(**values: object) -> Recipe:
@@ -32,12 +33,30 @@ def test_the_paper_s_runs(preset: str, dataset: str, epochs: int, schedule: str)
     found = recipe_from(PRESETS[preset])
     assert (found.dataset, found.epochs, found.schedule) == (dataset, epochs, schedule)
     assert (found.lr, found.halve_every) == (5e-4, 200)
-    assert (found.coarse_gamma == 0.1) == (preset == "cityscapes-coarse")
-    assert found.arch.semantic == (dataset != "sceneflow")
+    assert (found.batch, found.accumulate, found.crop) == (6, 1, (256, 512))
+    assert (found.betas, found.steps, found.count) == ((0.9, 0.999), None, None)
+    assert found.coarse_gamma == (0.1 if preset == "cityscapes-coarse" else 0)
+    assert found.arch == Arch(c=8, semantic=dataset != "sceneflow")
+    assert found.augmentation == Augmentation()
+    assert DATASETS[dataset].k == (2 if dataset == "kitti2015" else 1.12)
 
 
-def test_every_preset_names_a_data_set() -> None:
-    assert {row["dataset"] for row in PRESETS.values()} <= DATASETS.keys()
+@pytest.mark.parametrize(
+    ("preset", "count", "epochs", "steps"),
+    [("streets", 4800, 5, 4000), ("streets-long", 20_000, 20, 66_667)],
+)
+def test_our_runs(preset: str, count: int, epochs: int, steps: int) -> None:
+    found = recipe_from(PRESETS[preset])
+    assert (found.dataset, found.count, found.epochs) == ("streets", count, epochs)
+    assert (found.lr, found.schedule, found.batch, found.arch) == (1e-3, "cosine", 6, Arch(c=8))
+    assert found.total_steps(count) == steps
+    colours = Augmentation(gain=0.2, gamma=0.2, colour=0.1, noise=4)
+    assert found.augmentation == colours
+
+
+def test_every_preset_is_a_recipe_of_a_data_set() -> None:
+    for row in PRESETS.values():
+        assert recipe_from(row).dataset in DATASETS
 
 
 def test_rate_is_halved_every_200_epochs() -> None:
@@ -80,6 +99,8 @@ def test_length_is_in_steps_or_in_epochs() -> None:
         ({"k": 1}, "k: .* greater than 1"),
         ({"augmentation": {"gain": 1}}, "augmentation.gain: .* less than 1"),
         ({"rate": 1}, "rate: "),
+        ({"k": float("inf")}, "k: .* finite number"),
+        ({"coarse_gamma": float("nan")}, "coarse_gamma: .* finite number"),
     ],
 )
 def test_wrong_recipes_are_one_line(values: dict[str, object], rule: str) -> None:

@@ -11,7 +11,7 @@ from rts2.model.data.catalog import open_dataset
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.train.distributed import World
 from rts2.model.train.recipe import recipe_from
-from rts2.model.train.source import class_shares, names_digest, open_samples
+from rts2.model.train.source import cached, class_shares, digest, fingerprint, open_samples
 
 
 def quiet(items: Iterable[object], _title: str, _total: int) -> Iterable[object]:
@@ -60,8 +60,8 @@ def test_labels_that_tell_nothing_are_refused(tmp_path: Path) -> None:
 
 def test_a_digest_is_of_the_names_in_order(pairs: Path) -> None:
     samples = open_dataset("folder", pairs)
-    assert names_digest(samples) == names_digest(list(samples))
-    assert names_digest(samples) != names_digest(samples[::-1])
+    assert digest(samples) == digest(list(samples))
+    assert digest(samples) != digest(samples[::-1])
 
 
 def test_streets_are_as_large_as_a_crop() -> None:
@@ -69,9 +69,24 @@ def test_streets_are_as_large_as_a_crop() -> None:
     samples = open_samples(recipe, None)
     assert len(samples) == 3
     assert samples[0].size == (96, 64)
-    assert names_digest(samples) != names_digest(
-        open_samples(recipe.model_copy(update={"data_seed": 1}), None)
-    )
+    assert digest(samples) != digest(open_samples(recipe.model_copy(update={"data_seed": 1}), None))
+
+
+def test_a_digest_tells_the_generator_where_there_is_one(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = recipe_from({"dataset": "streets", "steps": 1, "count": 3, "crop": (64, 96)})
+    streets = open_samples(recipe, None)
+    before = digest(streets)
+    assert fingerprint(streets) is not None
+    for samples in (streets, open_dataset("folder", pairs)):
+        kept = cached(samples, tmp_path)
+        assert fingerprint(kept) == fingerprint(samples)
+        assert digest(kept) == digest(samples)
+    assert fingerprint(open_dataset("folder", pairs)) is None
+    monkeypatch.setattr("rts2.model.data.streets.VERSION", 999)
+    assert [sample.name for sample in open_samples(recipe, None)] == [s.name for s in streets]
+    assert digest(open_samples(recipe, None)) != before
 
 
 def test_an_unknown_data_set_is_refused() -> None:

@@ -66,6 +66,30 @@ def test_the_header_comes_back(tmp_path: Path) -> None:
     assert read_standing(tmp_path / "s") == standing(0)
 
 
+def test_loss_scaling_goes_on(tmp_path: Path) -> None:
+    """Its counts are whole numbers, as torch's update takes nothing else."""
+    network, optimizer = learner()
+    scaler = torch.amp.GradScaler("cpu", init_scale=1024.0, growth_interval=2)
+
+    def update(one: torch.amp.GradScaler) -> float:
+        weight = torch.nn.Parameter(torch.ones(1))
+        moved = torch.optim.SGD([weight])
+        one.scale(weight.sum()).backward()
+        one.step(moved)
+        one.update()
+        return one.get_scale()
+
+    assert update(scaler) == 1024
+    told = standing(1).model_copy(update={"scaler": scaler.state_dict()})
+    save_state(tmp_path / "s", told, network, optimizer)
+    found = read_standing(tmp_path / "s").scaler
+    assert found == scaler.state_dict()
+    assert [type(value) for value in found.values()] == [float, float, float, int, int]
+    again = torch.amp.GradScaler("cpu")
+    again.load_state_dict(found)
+    assert update(again) == 2048  # the second step in a row that was finite
+
+
 def test_broken_and_foreign_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "s"
     network, optimizer = learner()

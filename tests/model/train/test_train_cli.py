@@ -25,6 +25,7 @@ from safetensors.torch import load_file
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, load, save
 from rts2.model.data.images import image_size
+from rts2.model.errors import Rts2Error
 from rts2.model.train import cli, run
 from rts2.model.train.cli import train
 
@@ -95,6 +96,7 @@ def test_a_run_leaves_a_network_and_its_story(done: Path) -> None:
     assert record["recipe"]["augmentation"]["gain"] == 0.2
     assert (record["steps"], record["images"], record["samples"]) == (6, 24, 7)
     assert record["versions"]["torch"] == torch.__version__
+    assert record["data"] is None
     assert sum(record["class_shares"]) == pytest.approx(1)
     assert [part["step"] for part in record["log"]] == [1, 2, 3, 4, 5, 6]
     log = rows(done)
@@ -185,17 +187,22 @@ def test_a_run_killed_at_any_moment_resumes_bit_by_bit(pairs: Path, tmp_path: Pa
     require_equal_runs(whole, broken)
 
 
-def ran_together(arguments: Sequence[str], processes: int) -> list[tuple[int, str]]:
-    """Runs one command in several processes, as torchrun would; exit codes and stderr."""
+def started_together(each: Sequence[Sequence[str]]) -> list[subprocess.Popen[str]]:
+    """Starts a process for each of the arguments, as torchrun would."""
+    processes = len(each)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(processes)}
     shared["LOCAL_WORLD_SIZE"] = str(processes)
-    running = [
+    return [
         start(arguments, RANK=str(rank), LOCAL_RANK=str(rank), **shared)
-        for rank in range(processes)
+        for rank, arguments in enumerate(each)
     ]
+
+
+def ended_together(running: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+    """Exit codes and stderr."""
     told = [process.communicate(timeout=120)[1] for process in running]
     return [(process.returncode, text) for process, text in zip(running, told, strict=True)]
 
@@ -211,7 +218,7 @@ def test_two_processes_take_the_steps_of_one(pairs: Path, tmp_path: Path) -> Non
     more = ["--init", str(first / "checkpoint.safetensors"), "--lr", "2e-5", "--k", "1.5"]
     more += ["--coarse-gamma", "0.1"]
     assert train(options(pairs, alone, 5, *more)) == 0
-    codes = ran_together(options(pairs, both, 5, *more), 2)
+    codes = ended_together(started_together([options(pairs, both, 5, *more)] * 2))
     assert [code for code, _ in codes] == [0, 0], codes
     for mine, its in zip(untimed(alone), untimed(both), strict=True):
         assert float(its["loss"]) == pytest.approx(float(mine["loss"]), rel=1e-5)
@@ -243,6 +250,78 @@ def test_a_wrong_number_of_processes_is_told_once(
     assert ("4 samples among 3; start one of 1, 2, 4 processes" in told) == (rank == 0)
 
 
+def test_what_one_process_lacks_is_told_once_with_its_number(pairs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    each = [options(data, out) for data in (pairs, tmp_path / "nowhere")]
+    (first, told), other = ended_together(started_together(each))
+    assert (first, *other) == (2, 2, "")
+    assert told.count("\n") == 1
+    assert re.search(r": process 1: .*nowhere", told), told
+    assert not out.exists()
+
+
+def test_a_process_that_lost_the_other_says_so(pairs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first, other = started_together([options(pairs, out, 10_000)] * 2)
+    while not (out / "log.csv").exists() or (out / "log.csv").read_text().count("\n") < 3:
+        time.sleep(0.01)
+        assert first.poll() is None
+    other.kill()
+    (code, told), _ = ended_together([first, other])
+    assert code == 1
+    assert told.count("\n") == 1
+    assert re.search(r"step \d+: process 0 lost the others .*; the checkpoint of step 0 is", told)
+
+
+@pytest.mark.parametrize(("local", "told"), [(1, True), (2, False)])
+def test_too_few_gpus_are_told_by_the_first_process_that_finds_none(
+    local: int,
+    told: bool,
+    pairs: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cli, "TELLING_SECONDS", 0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    names = {"RANK": local, "LOCAL_RANK": local, "WORLD_SIZE": 4, "LOCAL_WORLD_SIZE": 4}
+    for name, value in names.items():
+        monkeypatch.setenv(name, str(value))
+    assert train(options(pairs, tmp_path / "out")) == 2
+    found = capsys.readouterr().err
+    assert found.count("\n") == told
+    assert told == (": process 1: every process needs a GPU of its own" in found)
+
+
+@pytest.mark.parametrize("address", [{}, {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1"}])
+def test_processes_that_cannot_meet_are_told_so_in_one_line(
+    address: dict[str, str], pairs: Path, tmp_path: Path
+) -> None:
+    """Torch's own stack, which it prints to the terminal, included."""
+    script = (
+        "import sys\n"
+        "from rts2.model.train import cli\n"
+        "whole, cli.TELLING_SECONDS = cli._trained, 0\n"
+        "def impatient(*given):\n"
+        "    from rts2.model.train import distributed\n"
+        "    distributed.MEETING_SECONDS = 1\n"
+        "    whole(*given)\n"
+        "cli._trained = impatient\n"
+        "sys.exit(cli.train())"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script, *options(pairs, tmp_path / "out")],
+        env=os.environ | {"RANK": "1", "WORLD_SIZE": "2"} | address,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1, ended.stderr
+    assert re.search(r"process 1: the processes cannot meet: .* torchrun", ended.stderr)
+
+
 MISTAKES: dict[str, tuple[list[str], int, str]] = {
     "no data set": (["--steps", "1"], 2, "give --preset or --dataset"),
     "no length": (["--dataset", "streets"], 2, "give --epochs or --steps"),
@@ -262,6 +341,13 @@ MISTAKES: dict[str, tuple[list[str], int, str]] = {
     "k": (["--preset", "kitti", "--k", "1"], 2, "k: .*greater than 1"),
     "init": (["--preset", "kitti", "--init", "nowhere.safetensors"], 2, "there is no such file"),
     "no network in the box": (["--preset", "kitti", "--init", "c99"], 2, "c99 is neither"),
+    "count of a folder": (["--preset", "kitti", "--count", "9"], 2, "--count .*kitti2015 lies in"),
+    "seed of a folder": (["--preset", "kitti", "--data-seed", "9"], 2, "--data-seed chooses"),
+    "count": (["--preset", "streets", "--count", "1000001"], 2, "from 1 to 1000000, not '1000001'"),
+    "digits": (["--preset", "streets", "--batch", "9" * 5000], 2, "from 1 to 1000000"),
+    "epochs": (["--preset", "streets", "--epochs", "1e7"], 2, "from 1e-6 to 1e6"),
+    "threads": (["--preset", "streets", "--threads", "9999"], 2, "from 1 to 1024, not '9999'"),
+    "workers": (["--preset", "streets", "--workers", "9999"], 2, "from 0 to 1024, not '9999'"),
     "precision": (["--preset", "streets", "--precision", "fp16", "--on", "cpu"], 2, "CUDA alone"),
 }
 
@@ -339,8 +425,109 @@ def test_a_folder_with_a_foreign_checkpoint_is_refused(
 ) -> None:
     save(build(Arch(c=1)), tmp_path / "checkpoint.safetensors", "dear to somebody")
     assert train(options(pairs, tmp_path)) == 2
-    assert "a checkpoint without its run; choose another --out" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "checkpoint.safetensors without its run (state.safetensors); choose another" in told
     assert load(tmp_path / "checkpoint.safetensors")[1].origin == "dear to somebody"
+
+
+@pytest.mark.parametrize("name", ["log.csv", "record.json"])
+def test_a_folder_with_a_foreign_file_is_refused(
+    name: str, pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("dear to somebody")
+    assert train(options(pairs, tmp_path)) == 2
+    assert f"holds {name} without its run" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "dear to somebody"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_place_that_cannot_be_written_is_told_before_classes_are_counted(
+    pairs: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def counted(*_: object) -> None:
+        raise AssertionError("counted")
+
+    monkeypatch.setattr(run, "class_shares", counted)
+    (tmp_path / "file").write_text("x")
+    assert train(options(pairs, tmp_path / "file" / "out", 4, "--k", "1.5")) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "cannot write" in told
+    with pytest.raises(AssertionError, match="counted"):
+        train(options(pairs, tmp_path / "new" / "out", 4, "--k", "1.5"))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_does_not_fit_in_memory_is_one_line(
+    pairs: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_: object) -> None:
+        raise MemoryError("9 TiB")
+
+    monkeypatch.setattr(run.Trainer, "step", full)
+    assert train(options(pairs, tmp_path / "step")) == 1
+    assert "step 1 does not fit in memory; give a larger --accum" in capsys.readouterr().err
+    monkeypatch.setattr("rts2.model.train.loader.crop", full)
+    assert train(options(pairs, tmp_path / "crop")) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "does not fit in memory; give a smaller --crop (9 TiB)" in told
+
+
+def test_the_checkpoint_named_is_the_one_on_the_disk(
+    pairs: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where the steps between two checkpoints are not what they were."""
+
+    def failing_in(step: int, every: str) -> str:
+        taken = run.Trainer.step
+
+        def fails(self: Any, micros: Any, rate: float) -> Any:
+            if self.updates == step - 1:
+                raise Rts2Error("it broke")
+            return taken(self, micros, rate)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(run.Trainer, "step", fails)
+            assert train(options(pairs, tmp_path, 20, "--checkpoint-every", every)) == 1
+        told = capsys.readouterr().err
+        origin = load(tmp_path / "checkpoint.safetensors")[1].origin
+        assert f"step {step}: it broke; the checkpoint of step " in told
+        kept = re.findall(r"step (\d+) is kept", told)[0]
+        assert kept == "0" or f" {kept} of 20 steps" in origin
+        return kept
+
+    assert failing_in(3, "4") == "0"
+    assert failing_in(6, "4") == "4"
+    assert failing_in(7, "5") == "5"
+    assert failing_in(9, "8") == "8"
+    assert failing_in(12, "10") == "10"
+    assert failing_in(13, "100") == "10"
+
+
+def test_a_run_goes_on_with_its_own_generator_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["--dataset", "streets", "--count", "2", "--batch", "1", "--k", "0", "--steps"]
+    more = ["--crop", "64x32", "--arch", "c=1", "--workers", "0", "--threads", "1"]
+    more += ["--out", str(tmp_path)]
+    assert train([*given, "1", *more]) == 0
+    record = json.loads((tmp_path / "record.json").read_text())
+    assert record["data"].startswith("streets v")
+    assert record["versions"].keys() >= {"opencv-python-headless", "embreex"}
+    monkeypatch.setattr("rts2.model.data.streets.VERSION", 999)
+    capsys.readouterr()
+    assert train([*given, "1", *more]) == 2
+    assert "another generator made them" in capsys.readouterr().err
 
 
 def interrupting(work: Callable[..., None], calls: int) -> Callable[..., None]:
@@ -355,13 +542,35 @@ def interrupting(work: Callable[..., None], calls: int) -> Callable[..., None]:
     return interrupted
 
 
+FIRST_WRITES = [("save_state", 0), ("Log", 0), ("Monitor", 0), ("save", 0), ("write_json", 0)]
+"""In their order; last comes the state's second."""
+
+
+@pytest.mark.parametrize(("write", "calls"), [*FIRST_WRITES, ("save_state", 1)])
+def test_a_run_interrupted_at_its_first_writes_goes_on(
+    write: str,
+    calls: int,
+    done: Path,
+    pairs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "out"
+    given = options(pairs, out, 6, "--k", "1.5", "--gain", "0.2")
+    with monkeypatch.context() as patch:
+        patch.setattr(run, write, interrupting(getattr(run, write), calls))
+        assert train(given) == 130
+    assert train(given) == 0
+    require_equal_runs(out, done)
+
+
 def test_a_full_disk_leaves_the_last_checkpoint(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     given = options(pairs, out, 9, "--checkpoint-every", "3")
     with monkeypatch.context() as patch:
-        patch.setattr(run, "save_state", interrupting(run.save_state, calls=2))
+        patch.setattr(run, "save_state", interrupting(run.save_state, calls=3))
         assert train(given) == 130
     before = (out / "state.safetensors").read_bytes()
 

@@ -1,0 +1,25 @@
+"""What the machine at hand is."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor() -> str:
+    """The processor's name and, where the system tells them, its family and model."""
+    known: dict[str, str] = {}
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(":")
+            known.setdefault(name.strip(), value.strip())
+    title = known.get("model name") or platform.processor() or platform.machine()
+    family, model = known.get("cpu family"), known.get("model")
+    return f"{title}, family {family}, model {model}" if family and model else title

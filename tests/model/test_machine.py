@@ -1,0 +1,37 @@
+"""What the machine says of itself."""
+
+import os
+import platform
+
+import pytest
+
+from rts2.model.machine import cores, processor
+
+
+def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {3, 5, 8}, raising=False)
+    assert cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    assert cores() == 7
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert cores() == 1
+
+
+TOLD = {
+    "all": (
+        "cpu family\t: 6\nmodel\t\t: 85\nmodel name\t: A CPU\nmodel name\t: B\n",
+        "A CPU, family 6, model 85",
+    ),
+    "the name alone": ("model name : A CPU\n", "A CPU"),
+    "nothing": ("processor : 0\n", "what the system says"),
+}
+
+
+@pytest.mark.parametrize("what", TOLD)
+def test_a_processor_is_named(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text, name = TOLD[what]
+    monkeypatch.setattr("pathlib.Path.exists", lambda _path: True)
+    monkeypatch.setattr("pathlib.Path.read_text", lambda _path, encoding: text)
+    monkeypatch.setattr(platform, "processor", lambda: "what the system says")
+    assert processor() == name
