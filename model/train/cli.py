@@ -182,10 +182,10 @@ def _of_dataset(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]
     found: dict[str, Any] = {"k": values.get("k", row.k) or None}
     if not row.has_folder:
         return found
-    for name in ("count", "data_seed"):
+    for name in ("count", "data_seed", "rectification_px"):
         if name in given:
             raise UsageError(
-                f"--{name.replace('_', '-')} chooses among generated scenes, and "
+                f"--{name.replace('_', '-')} is for generated scenes, and "
                 f"{values['dataset']} lies in a folder; leave it out, or give --split a list"
             )
     return found | {"count": None}  # the preset's, where it is of generated scenes
@@ -236,6 +236,7 @@ FIELDS = (
     "split",
     "count",
     "data_seed",
+    "rectification_px",
     "epochs",
     "steps",
     "batch",
@@ -305,6 +306,8 @@ def _add_schedule(command: argparse.ArgumentParser) -> None:
     group.add_argument("--seed", type=seed, metavar="N", help="of weights, order and crops")
     group.add_argument("--count", type=_whole, metavar="N", help="how many streets there are")
     group.add_argument("--data-seed", type=seed, metavar="N", help="which streets they are")
+    text = "spread of a vertical offset of the streets' right images"
+    group.add_argument("--rectification-px", type=float, metavar="PX", help=text)
 
 
 def _add_objective(command: argparse.ArgumentParser) -> None:

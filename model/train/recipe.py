@@ -60,6 +60,8 @@ class Recipe(BaseModel):
     """How many scenes a procedural data set has."""
     data_seed: Annotated[int, Field(ge=0)] = 0
     """Which scenes a procedural data set has."""
+    rectification_px: Annotated[float, Field(ge=0, le=8)] = 0.0
+    """The spread of a vertical offset of its right images: real pairs are never quite rectified."""
     arch: Arch = Arch()
     init: str | None = None
     """The SHA-256 of the checkpoint whose weights it starts from; None starts from random ones."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from ..data.cache import Cached
-from ..data.catalog import DATASETS, open_dataset
+from ..data.catalog import DATASETS, STREETS, open_dataset
 from ..data.scene import Sample
-from ..errors import Rts2Error
+from ..errors import Rts2Error, UsageError
 from ..metrics import IGNORED
 from .distributed import World
 from .loader import Fault, ended, fault, one_thread, require_labels
@@ -110,6 +110,8 @@ def open_samples(recipe: Recipe, folder: Path | None) -> Sequence[Sample]:
     split = recipe.split
     if split is None and recipe.dataset in DATASETS:
         split = DATASETS[recipe.dataset].trained
+    if recipe.dataset == STREETS and split == DATASETS[STREETS].judged:
+        raise UsageError(f"the {STREETS} of {split} judge, and never train; leave --split out")
     return open_dataset(
         recipe.dataset,
         folder,
@@ -117,6 +119,7 @@ def open_samples(recipe: Recipe, folder: Path | None) -> Sequence[Sample]:
         count=recipe.count,
         size=(width, height),
         seed=recipe.data_seed,
+        rectification_px=recipe.rectification_px,
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from rts2.model.data.catalog import open_dataset
+from rts2.model.data.streets import Streets
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.train.distributed import World
 from rts2.model.train.recipe import recipe_from
@@ -92,3 +93,11 @@ def test_a_digest_tells_the_generator_where_there_is_one(
 def test_an_unknown_data_set_is_refused() -> None:
     with pytest.raises(UsageError, match=r"a data set must be one of .* not 'mars'"):
         open_samples(recipe_from({"dataset": "mars", "steps": 1}), None)
+
+
+def test_recipe_chooses_the_streets() -> None:
+    values = {"dataset": "streets", "steps": 1, "count": 3, "data_seed": 5, "crop": (64, 96)}
+    found = open_samples(recipe_from(values | {"rectification_px": 0.3}), None)
+    assert isinstance(found, Streets)
+    assert (len(found), found.seed, found.size) == (3, 5, (96, 64))
+    assert found.look.rectification_px == 0.3
