@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import sleep
@@ -32,6 +33,9 @@ BRANCHES = {
     "full": {"semantic": True, "refinement": True},
 }
 
+
+SILENT = 20
+"""So few samples are counted before anybody asks what goes on."""
 
 TELLING_SECONDS = 2
 """How long a process keeps quiet about an error that another one may tell: torchrun ends all once
@@ -126,6 +130,8 @@ def _setting(options: argparse.Namespace, world: World) -> Setting:
 
 
 def _shown(items: Iterable[Any], title: str, total: int) -> Iterable[Any]:
+    if total > SILENT and not sys.stderr.isatty():
+        print(f"{title} on {total} samples", file=sys.stderr, flush=True)
     return progress(items, title, total)
 
 
@@ -382,6 +388,8 @@ def _report(options: argparse.Namespace, recipe: Recipe, finished: Finished) -> 
             }
         )
         return
+    if finished.resumed_at == finished.steps:
+        print("nothing was left to do; to go further: --init its checkpoint, in another --out")
     first, last = tenths[0], tenths[-1]
     print(f"{recipe.arch.label()} · {recipe.dataset} · {finished.steps} steps of {recipe.batch}")
     print(f"loss      {first['loss']:.3f} in the first tenth, {last['loss']:.3f} in the last")

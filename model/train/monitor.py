@@ -36,6 +36,8 @@ class Monitor:
         self.curves = _writer(folder / "tensorboard", done)
         self.start = self.told = monotonic()
         self.smooth: float | None = None
+        if done:
+            sys.stderr.write(f"going on from step {done} of {steps}\n")
         self.bar, self.task = _bar(steps, done)
 
     def step(self, row: Mapping[str, float]) -> None:

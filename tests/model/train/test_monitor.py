@@ -63,6 +63,7 @@ def test_where_there_is_no_terminal_lines_tell(
     lines = capsys.readouterr().err.splitlines()
     # A step every 20 s, a line every 30 s: after 40 s and 80 s; 4 steps took 80 s, 4 are left.
     assert lines == [
+        "going on from step 2 of 10",
         "step 4 of 10 · epoch 0 · loss 4.000 · 12.0 images/s, 25% waiting · 0:02:00 left",
         "step 6 of 10 · epoch 0 · loss 4.000 · 12.0 images/s, 25% waiting · 0:01:20 left",
     ]
