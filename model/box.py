@@ -35,7 +35,7 @@ def named_model(text: str) -> Path:
         return path
     raise UsageError(
         "a model (a checkpoint or an ONNX file) must be a file, or the name of a network in the "
-        f"box: {text} is neither; {_listed()}"
+        f"box: {text} is neither; {listed()}"
     )
 
 
@@ -60,7 +60,8 @@ def _is_word(text: str) -> bool:
     return text not in ("", ".", "..") and Path(text).name == text and not Path(text).suffix
 
 
-def _listed() -> str:
+def listed() -> str:
+    """What the box holds, in words."""
     found = names()
     return (
         f"the box holds {', '.join(found)}"

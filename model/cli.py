@@ -37,7 +37,7 @@ from .data.images import (
     write_indexed,
 )
 from .data.layout import IMAGES, images_of
-from .data.scene import Sample, require_crop_fits
+from .data.scene import Sample, fingerprint, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
 from .pictures import PALETTE, coloured, overlay
@@ -141,7 +141,7 @@ def evaluate(arguments: Sequence[str] | None = None) -> int:
         "dataset": options.dataset,
         "split": options.split,
         "samples": len(samples),
-        "data": getattr(samples, "fingerprint", None),
+        "data": fingerprint(samples),
         "crop": options.crop,
         "foreground": samples[0].foreground,
         **evaluation.report(scores, options.dataset),

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from ..model.arch import UNTRAINED, Precision
-from ..model.box import holding, named_model
-from ..model.box import names as boxed_names
+from ..model.box import holding, listed, named_model
 from ..model.console import (
     KITTI,
     add_output,
@@ -235,8 +234,8 @@ def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Net
         boxed = holding(asked.arch)
         if boxed is None:
             raise UsageError(
-                f"the box ({', '.join(boxed_names())}) does not hold {asked.arch.label()}: give "
-                "--model CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
+                f"no network in the box holds {asked.arch.label()}; {listed()}: give --model "
+                "CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
             )
         network, header = load_checkpoint(boxed)
         return cut(network, asked.arch), f"{boxed.stem} of the box, {header.origin}"

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ..errors import Rts2Error
 from ..files import output_folder, write_bytes
-from .scene import Foreground, Sample, Scene
+from .scene import Foreground, Sample, Scene, fingerprint
 
 MAGIC: Final = b"rts2 scene 1\n"
 """Names the format; another number stands for another layout."""
@@ -82,7 +82,8 @@ class Cached(Sequence[Sample]):
     def __init__(self, samples: Sequence[Sample], folder: Path) -> None:
         self.samples = samples
         self.folder = _usable(folder.absolute())
-        self._whole = _fingerprint(samples)
+        self.fingerprint = fingerprint(samples)
+        """That of the data set behind it; None where only its samples have one."""
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -99,7 +100,7 @@ class Cached(Sequence[Sample]):
         return self._cached(range(len(self))[index])
 
     def _cached(self, index: int) -> CachedSample:
-        whole = None if self._whole is None else f"{self._whole} {index}"
+        whole = None if self.fingerprint is None else f"{self.fingerprint} {index}"
         return CachedSample(self.samples[index], self.folder, whole)
 
 
@@ -141,7 +142,7 @@ class CachedSample:
         return scene
 
     def _key(self) -> str:
-        own = _fingerprint(self.sample)
+        own = fingerprint(self.sample)
         if own is None and self.whole is None:
             raise Rts2Error(f"a sample needs a fingerprint to be cached: {self.sample.name}")
         text = "\n".join((MAGIC.decode(), self.sample.name, own or "", self.whole or ""))
@@ -242,8 +243,3 @@ def _decoded(data: bytearray, start: int, stored: Stored) -> NDArray[Any]:
 
 def _aligned(size: int) -> int:
     return -(-size // ALIGNED) * ALIGNED
-
-
-def _fingerprint(thing: object) -> str | None:
-    told = getattr(thing, "fingerprint", None)
-    return None if told is None else str(told)

@@ -82,6 +82,12 @@ class Sample(Protocol):
         """The images and what is known of them."""
 
 
+def fingerprint(thing: object) -> str | None:
+    """What a sample or a data set says it depends on; None where it says nothing."""
+    told = getattr(thing, "fingerprint", None)
+    return None if told is None else str(told)
+
+
 def require_crop_fits(crop: tuple[int, int], size: tuple[int, int], name: str) -> None:
     """Raises `UsageError` where a crop (width, height) is larger than the image."""
     if crop[0] > size[0] or crop[1] > size[1]:

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 
 from ..arch import UNTRAINED
 from ..checkpoint import Network, build, not_finite, save
-from ..data.scene import Sample
+from ..data.scene import Sample, fingerprint
 from ..errors import Rts2Error, UsageError
 from ..files import output_folder, write_json
 from ..machine import processor
@@ -28,7 +28,7 @@ from .log import Log, Row, read_log
 from .monitor import Monitor
 from .precision import Resolved, resolve
 from .recipe import Recipe
-from .source import Shown, class_shares, digest, fingerprint
+from .source import Shown, class_shares, digest
 from .state import Standing, read_standing, restore, save_state
 from .trainer import Outcome, Trainer, term_names
 

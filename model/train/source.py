@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from ..data.cache import Cached
 from ..data.catalog import DATASETS, STREETS, open_dataset
-from ..data.scene import Sample
+from ..data.scene import Sample, fingerprint
 from ..errors import Rts2Error, UsageError
 from ..metrics import IGNORED
 from .distributed import World
@@ -23,15 +23,6 @@ from .recipe import Recipe
 
 Shown = Callable[[Iterable[Any], str, int], Iterable[Any]]
 """Passes items on and shows how far they are: (items, title, total)."""
-
-
-def fingerprint(samples: Sequence[Sample]) -> str | None:
-    """What a generator says of itself; None for files, which are known by their names.
-
-    The fingerprint of a file is where it lies and when it was written, which may change.
-    """
-    told = getattr(samples.samples if isinstance(samples, Cached) else samples, "fingerprint", None)
-    return None if told is None else str(told)
 
 
 def digest(samples: Sequence[Sample]) -> str:

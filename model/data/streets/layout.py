@@ -265,7 +265,7 @@ def _vehicle(
 def _moving(
     rng: Rng, builder: Builder, lanes: int, lane_m: float, own: float, density: float
 ) -> None:
-    """Traffic in the lanes, ahead and oncoming, riders among it, and a tram now and then."""
+    """Traffic in the lanes, ahead and oncoming, and riders among it."""
     for lane in range(lanes):
         o = (lane + 0.5) * lane_m - lanes * lane_m / 2
         same = abs(o - own) < lane_m / 2 or (o > 0) == (own > 0)

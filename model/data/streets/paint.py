@@ -69,8 +69,8 @@ def coat(
     chance = rng.random(8).tolist()
     base = [_within(value * (0.8 + 0.4 * at)) for value, at in zip(colour, chance[:3], strict=True)]
     low, high = 1 - contrast * (0.5 + 0.5 * chance[3]), 1 + contrast * (0.5 + 0.5 * chance[4])
-    first = [_within(low * value) for value in base] if second is None else base
-    other = [_within(high * value) for value in base] if second is None else second
+    first = [low * value for value in base] if second is None else base
+    other = [high * value for value in base] if second is None else second
     spread, turn = rng.standard_normal(2).tolist()
     pattern, grains = patterns(kind), patterns("noise")
     return Paint(

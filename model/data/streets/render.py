@@ -17,8 +17,7 @@ from .textures import sample
 
 Floats = NDArray[np.float32]
 BLOCK = 8192
-NOTHING = -1
-"""The index of the triangle that a ray into the sky hits."""
+"""How many rays are shaded at once, which bounds the memory of large images."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +82,7 @@ class Hits:
     """What the pixels of one view see, (n,) each."""
 
     triangle: NDArray[np.int32]
+    """−1 in the sky."""
     depth: NDArray[np.float64]
     """z in metres, infinite in the sky."""
 
@@ -133,7 +133,7 @@ class World:
         offset = reach - (nx * origin[0] + ny * origin[1] + nz * origin[2])
         depth = np.full(len(rays), np.inf)
         depth[hit] = np.clip(offset / np.where(np.abs(toward) < 1e-12, 1e-12, toward), 0.05, 1e4)
-        return Hits(np.where(found >= 0, found, NOTHING).astype(np.int32), depth)
+        return Hits(found, depth)
 
     def blocked(self, start: Floats, rays: Floats, reach: float) -> NDArray[np.bool_]:
         """Whether something lies on each ray between its start and `reach` times its length."""
@@ -161,10 +161,7 @@ def _dot(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
 
 
 def look(world: World, rays: Floats, origin: NDArray[Any], focal_px: float) -> tuple[Hits, Floats]:
-    """What rays (n, 3) from `origin` hit, and its linear RGB (n, 3).
-
-    Done in blocks that stay in the processor's cache, which is faster than all at once.
-    """
+    """What rays (n, 3) from `origin` hit, and its linear RGB (n, 3)."""
     triangle = np.empty(len(rays), np.int32)
     depth = np.empty(len(rays), np.float64)
     colours = np.empty_like(rays)
