@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -238,6 +239,11 @@ def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Net
                 "CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
             )
         network, header = load_checkpoint(boxed)
+        logging.getLogger(__name__).warning(
+            "note: the accuracy that the search promises needs the training that it rests on; "
+            "the weights of %s were %s (rts2-eval judges them, rts2-train --init %s goes on)",
+            *(boxed.stem, header.origin, boxed.stem),
+        )
         return cut(network, asked.arch), f"{boxed.stem} of the box, {header.origin}"
     import torch
 

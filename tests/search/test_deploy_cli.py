@@ -240,12 +240,14 @@ def test_a_pick_takes_its_weights_from_the_box(
     front: Callable[..., Path],
     checkpoint: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     path = checkpoint(WHOLE)
     monkeypatch.setattr("rts2.model.box._folder", lambda: path.parent)
-    told = run("--device", "cpu", "--front", front("cpu"), "--json").json
-    assert told["arch"] == PICK.model_dump(mode="json")
-    assert told["weights"].startswith(f"{path.stem} of the box, ")
+    ended = run("--device", "cpu", "--front", front("cpu"), "--json")
+    assert ended.json["arch"] == PICK.model_dump(mode="json")
+    assert ended.json["weights"].startswith(f"{path.stem} of the box, ")
+    assert "the accuracy that the search promises needs the training" in caplog.text
 
 
 def test_a_checkpoint_that_does_not_hold_the_pick_is_refused_with_each_difference(
