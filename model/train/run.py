@@ -38,7 +38,7 @@ LOG: Final = "log.csv"
 RECORD: Final = "record.json"
 """The files of a run."""
 
-COMPUTING: Final = ("rts2", "torch", "numpy", "opencv-python-headless", "embreex")
+COMPUTING: Final = ("rts2", "torch", "numpy", "opencv-python-headless", "numba")
 """The packages whose versions may decide a bit of the weights."""
 
 TENTHS: Final = 10

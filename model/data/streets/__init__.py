@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import Rts2Error, UsageError
+from ...errors import UsageError
 from ..scene import Foreground, Scene
 
 if TYPE_CHECKING:
-    from .render import Camera, Light
+    from .shading import Camera, Light
     from .soup import Soup
 
 FOCAL_PX = 721.5377
@@ -29,7 +29,7 @@ CENTRE = (609.559, 172.854)
 NEAREST_M = 2.1
 """Nothing that stands on the street comes closer: 185 pixels of disparity in KITTI's frames."""
 
-VERSION = 2
+VERSION = 3
 """Another generator makes other scenes."""
 
 
@@ -62,11 +62,7 @@ class Street:
         return "instance"
 
     def read(self) -> Scene:
-        """The images, the exact disparity (0 in the sky), labels, occlusion and objects.
-
-        Raises `Rts2Error` on a machine for which the ray caster has no wheel.
-        """
-        _require_caster()
+        """The images, the exact disparity (0 in the sky), labels, occlusion and objects."""
         return _scene(self)
 
 
@@ -104,63 +100,62 @@ class Streets(Sequence[Street]):
         return Street(self.seed, self._range[index], self.size, self.look)
 
 
-def _require_caster() -> None:
-    try:
-        import embreex  # noqa: F401
-    except ImportError as error:
-        raise Rts2Error(
-            "streets needs the ray caster embreex, which has no wheel for this machine; "
-            "make the data on an x86-64 machine with --cache, or use another data set"
-        ) from error
-
-
 def _scene(street: Street) -> Scene:
     from . import render, sensor
     from .layout import street as drawn
 
     rng = np.random.default_rng([VERSION, street.seed, street.index])
-    camera = _camera(rng, street.size)
+    left = _camera(rng, street.size)
+    right = left._replace(x_m=BASELINE_M)
     yaw = float(rng.normal(0, 0.05))
     pose = _pose(rng, yaw)
-    soup = drawn(rng, yaw, camera.sides)
-    world = render.World(_cleared(soup.seen(pose), camera.nearest_m), _light(rng, pose))
-    offset = rng.normal(0, 1) * street.look.rectification_px
-    width, height = camera.size
-    x, y = camera.grid()
-    rays = camera.rays(x, y)
-    left_eye, right_eye = np.zeros(3), np.array([camera.baseline_m, 0, 0])
-    shape = (height, width, 3)
-    hits, first = render.look(world, rays, left_eye, camera.focal_px)
-    other = camera.rays(x, y + np.float32(offset))
-    seen, second = render.look(world, other, right_eye, camera.focal_px)
-    first, second = first.reshape(shape), second.reshape(shape)
-    eyes = sensor.pair(rng, first, street.look.difference)
+    soup = drawn(rng, yaw, _sides(left)).seen(pose)
+    world = render.World(_cleared(soup, _nearest_m(left)), _light(rng, pose))
+    eyes = (left, _lowered(right, rng.normal(0, 1) * street.look.rectification_px))
+    hits = [render.see(world, eye) for eye in eyes]
+    first, second = render.look(world, eyes, hits)
+    sensors = sensor.pair(rng, first, street.look.difference)
     noise = rng if street.look.noise else None
-    ids, things = render.labels(world, hits)
-    disparity = camera.focal_px * camera.baseline_m / hits.depth
-    visible = render.visible(world, hits, None if offset else seen, rays, camera, x)
+    ids, things = render.labels(world, hits[0])
     return Scene(
         name=street.name,
-        left=sensor.expose(first, eyes[0], noise),
-        right=sensor.expose(second, eyes[1], noise),
-        truth=disparity.reshape(height, width).astype(np.float32),
-        foreground=(things != 0).reshape(height, width),
-        semantic=ids.reshape(height, width),
-        visible=visible.reshape(height, width),
-        instances=things.reshape(height, width),
+        left=sensor.expose(first, sensors[0], noise),
+        right=sensor.expose(second, sensors[1], noise),
+        truth=(left.focal_px * BASELINE_M * hits[0].nearness).astype(np.float32),
+        foreground=things != 0,
+        semantic=ids,
+        visible=render.visible(world, hits[0], left, right),
+        instances=things,
     )
 
 
 def _camera(rng: np.random.Generator, size: tuple[int, int]) -> Camera:
     """KITTI's camera, or a random window of it; larger images have more pixels per degree."""
-    from .render import Camera
+    from .shading import Camera
 
     scale = max(1.0, size[0] / KITTI_SIZE[0], size[1] / KITTI_SIZE[1])
     room = [scale * whole - side for whole, side in zip(KITTI_SIZE, size, strict=True)]
     x, y = (rng.uniform(0, max(space, 0.0)) for space in room)
     zoom = 1.0 if size == KITTI_SIZE else float(np.exp(rng.normal(0, 0.1)))
     centre = (float(scale * CENTRE[0] - x), float(scale * CENTRE[1] - y))
-    return Camera(FOCAL_PX * scale * zoom, centre, size, BASELINE_M, NEAREST_M * zoom)
+    return Camera(FOCAL_PX * scale * zoom, centre, size)
+
+
+def _lowered(eye: Camera, rows: float) -> Camera:
+    """The eye with its image moved up by so many rows."""
+    return eye._replace(centre=(eye.centre[0], eye.centre[1] - rows))
+
+
+def _sides(eye: Camera) -> tuple[float, float]:
+    """The tangents of the window's left and right border."""
+    left = -eye.centre[0] / eye.focal_px
+    return left, left + eye.size[0] / eye.focal_px
+
+
+def _nearest_m(eye: Camera) -> float:
+    """Zooming in moves the nearest things away, so that disparities keep their limit."""
+    scale = max(1.0, eye.size[0] / KITTI_SIZE[0], eye.size[1] / KITTI_SIZE[1])
+    return NEAREST_M * eye.focal_px / (FOCAL_PX * scale)
 
 
 def _pose(rng: np.random.Generator, yaw: float) -> NDArray[np.float64]:
@@ -189,7 +184,7 @@ def _cleared(soup: Soup, nearest_m: float) -> Soup:
 
 def _light(rng: np.random.Generator, pose: NDArray[np.float64]) -> Light:
     """A day: sunny, veiled or overcast."""
-    from .render import Light
+    from .shading import Light
     from .textures import patterns
 
     rise, turn = rng.uniform(0.25, 1.25), rng.uniform(0, 2 * np.pi)
@@ -198,16 +193,19 @@ def _light(rng: np.random.Generator, pose: NDArray[np.float64]) -> Light:
     blue = np.array([0.45, 0.6, 0.95]) * rng.uniform(0.5, 1.3)
     grey = np.full(3, rng.uniform(0.7, 1.6)) * [1, 1.01, 1.04]
     return Light(
-        sun=(pose @ sun).astype(np.float32),
-        up=(pose @ np.array([0.0, -1, 0])).astype(np.float32),
+        sun=_three(pose @ sun),
+        up=_three(pose @ np.array([0.0, -1, 0])),
         strength=0.0 if overcast else float(rng.uniform(0.5, 3.2)),
-        warmth=np.array([1, rng.uniform(0.85, 1), rng.uniform(0.7, 1)], np.float32),
-        ambient=(rng.uniform(0.25, 0.75) * np.array([0.93, 1, rng.uniform(1, 1.15)])).astype(
-            np.float32
-        ),
-        zenith=(grey if overcast else blue).astype(np.float32),
-        horizon=(grey * rng.uniform(0.9, 1.2)).astype(np.float32),
+        warmth=_three(np.array([1, rng.uniform(0.85, 1), rng.uniform(0.7, 1)])),
+        ambient=_three(rng.uniform(0.25, 0.75) * np.array([0.93, 1, rng.uniform(1, 1.15)])),
+        zenith=_three(grey if overcast else blue),
+        horizon=_three(grey * rng.uniform(0.9, 1.2)),
         clouds=float(rng.uniform(0, 0.9)),
         cloud_pattern=int(patterns("noise")[int(rng.integers(4))]),
         haze=float(rng.exponential(0.0004)),
     )
+
+
+def _three(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    first, second, third = values.tolist()
+    return first, second, third

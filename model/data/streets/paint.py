@@ -34,22 +34,31 @@ class Paint:
     """Light of its own: lamps."""
 
 
-def table(paints: Sequence[Paint]) -> NDArray[np.float32]:
-    """(n, 13): the fields of all paints in the order of `Paint`."""
-    rows = [(*p.first, *p.second, *_rest(p)) for p in paints]
-    return np.asarray(rows, np.float32).reshape(len(rows), 13)
+TABLE = np.dtype(
+    [
+        ("first", np.float64, 3),
+        ("second", np.float64, 3),
+        ("pattern", np.int64),
+        ("tiles_per_m", np.float64),
+        ("grain", np.int64),
+        ("grains_per_m", np.float64),
+        ("grain_strength", np.float64),
+        ("gloss", np.float64),
+        ("glow", np.float64),
+    ]
+)
 
 
-def _rest(paint: Paint) -> tuple[float, ...]:
-    return (
-        paint.pattern,
-        1 / paint.tile_m,
-        paint.grain,
-        1 / paint.grain_m,
-        paint.grain_strength,
-        paint.gloss,
-        paint.glow,
-    )
+def table(paints: Sequence[Paint]) -> NDArray[np.void]:
+    """All paints as rows of `TABLE`."""
+    rows = [
+        (
+            p.first, p.second, p.pattern, 1 / p.tile_m, p.grain, 1 / p.grain_m, p.grain_strength,
+            p.gloss, p.glow,
+        )
+        for p in paints
+    ]  # fmt: skip
+    return np.array(rows, TABLE)
 
 
 def coat(

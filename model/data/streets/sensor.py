@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
@@ -64,15 +65,37 @@ def expose(light: NDArray[np.float32], sensor: Sensor, rng: np.random.Generator 
         signal *= _falloff(light.shape[:2], sensor.vignette)
     if sensor.blur_px > 0:
         signal = np.asarray(cv2.GaussianBlur(signal, (0, 0), sensor.blur_px), np.float32)
-    if rng is not None:
-        spread = np.sqrt(np.maximum(signal, 0)) * np.float32(sensor.shot)
-        spread += np.float32(sensor.read)
-        spread *= _grains(rng, signal.size).reshape(signal.shape)
-        signal += spread
-    signal -= np.float32(sensor.black)
-    signal *= np.float32(_STEPS / (1 - sensor.black))
-    steps = np.clip(signal, 0, _STEPS, out=signal).astype(np.uint16)
-    return _tones(sensor.gamma).take(steps)
+    noisy = rng is not None
+    return _developed(
+        signal,
+        _tones(sensor.gamma),
+        sensor.black,
+        sensor.shot if noisy else 0.0,
+        sensor.read if noisy else 0.0,
+        _pool(),
+        int(rng.integers(_POOL)) if rng is not None else 0,
+    )
+
+
+@njit(cache=True)
+def _developed(
+    signal: NDArray[np.float32],
+    tones: Bytes,
+    black: float,
+    shot: float,
+    read: float,
+    pool: NDArray[np.float32],
+    start: int,
+) -> Bytes:
+    """Adds noise from `start` of the pool on, and gives each step of the signal its tone."""
+    image = np.empty(signal.shape, np.uint8)
+    flat, shown = signal.reshape(-1), image.reshape(-1)
+    for i in range(len(flat)):
+        grain = pool[(start + i) % len(pool)]
+        value = flat[i] + grain * (read + shot * np.sqrt(max(flat[i], 0.0)))
+        step = (value - black) / (1 - black) * _STEPS
+        shown[i] = tones[int(min(max(step, 0.0), _STEPS))]
+    return image
 
 
 _STEPS = 65535
@@ -81,13 +104,8 @@ _POOL = 1 << 21
 
 @lru_cache(maxsize=1)
 def _pool() -> NDArray[np.float32]:
+    """Normal values that are drawn once; an image takes a stretch of them, which is faster."""
     return np.random.default_rng(1).standard_normal(_POOL, np.float32)
-
-
-def _grains(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """`count` normal values: a random stretch of a pool that is drawn once, which is faster."""
-    start = int(rng.integers(_POOL))
-    return np.take(_pool(), np.arange(start, start + count), mode="wrap")
 
 
 def _tones(gamma: float) -> Bytes:

@@ -178,11 +178,22 @@ def surface(points: NDArray[Any]) -> Shape:
 
 
 def _woven(points: NDArray[Any], uv: NDArray[Any]) -> Shape:
-    def around(values: NDArray[Any]) -> NDArray[Any]:
-        cells = [values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]]
-        return np.stack([cell.reshape(-1, values.shape[-1]) for cell in cells], 1)
+    """Sheets (rows, columns, 3) and (rows, columns, 2) → two triangles a cell."""
+    order = _weave(*points.shape[:2])
 
-    return quads(around(points), around(uv))
+    def triangles(values: NDArray[Any]) -> Floats:
+        depth = values.shape[-1]
+        return values.reshape(-1, depth).astype(np.float32).take(order, 0).reshape(-1, 3, depth)
+
+    return Shape(triangles(points), triangles(uv))
+
+
+@lru_cache(maxsize=64)
+def _weave(rows: int, columns: int) -> NDArray[np.int64]:
+    """Which points of a sheet are the triangles' corners, three each."""
+    number = np.arange(rows * columns).reshape(rows, columns)
+    around = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+    return np.stack([cells.ravel() for cells in around], 1).take(_SPLIT, 1).ravel()
 
 
 def foliage(rng: np.random.Generator, radii: NDArray[Any], leaf: float, count: int) -> Shape:

@@ -43,7 +43,7 @@ class Soup:
     """(n,), a number for each object of its own, 0 for the rest."""
     part: NDArray[np.int32]
     """(n,), which triangles were set down together."""
-    paints: NDArray[np.float32]
+    paints: NDArray[np.void]
     eye: NDArray[np.float64]
     """Where the left camera stands, 3 metres."""
 
@@ -73,7 +73,10 @@ class Road:
         turn = self.bend * s
         x = self.bend * s**2 / 2 + o * np.cos(turn)
         y = -self.slope * s - self.crest * s**2 / 2 - up
-        return np.stack(np.broadcast_arrays(x, y, s - o * np.sin(turn)), -1)
+        z = s - o * np.sin(turn)
+        places = np.empty((*np.broadcast_shapes(x.shape, y.shape, z.shape), 3))
+        places[..., 0], places[..., 1], places[..., 2] = x, y, z
+        return places
 
     def heading(self, s: float) -> float:
         return self.bend * s

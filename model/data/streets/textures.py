@@ -1,26 +1,17 @@
 """Procedural surface patterns, drawn once a process into one atlas with all levels of detail.
 
-A pattern is a tileable square of values in 0 … 1; materials mix two colours by it. One atlas and
-one remap serve all pixels of an image, whatever they show.
+A pattern is a tileable square of values in 0 … 1; materials mix two colours by it.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-Tile = NDArray[np.float32]
+from .shading import LEVELS, SIDE, Tile
 
-SIDE = 256
-"""Texels of a pattern's side at the finest level."""
-
-LEVELS = 6
-_ROW = 4096
 _SEED = 20200531
 
 KINDS: dict[str, int] = {
@@ -48,41 +39,19 @@ def patterns(kind: str) -> range:
     raise KeyError(kind)
 
 
-def sample(pattern: NDArray[np.integer[Any]], u: Floats, v: Floats, texels: Floats) -> Tile:
-    """The patterns' values at (`u`, `v`), counted in tiles; all arrays are one-dimensional.
-
-    `texels` is how many texels of the finest level one pixel covers; it picks the level, so that
-    distant surfaces do not flicker.
-    """
-    atlas, starts = _atlas()
-    level = np.clip(np.log2(np.maximum(texels, 1e-6)) + 1.0, 0, LEVELS - 1).astype(np.int32)
-    side = (SIDE >> level).astype(np.float32)
-    x = (u - np.floor(u)) * side + starts[level]
-    y = (v - np.floor(v)) * side + pattern * np.float32(SIDE + 1)
-    found = cv2.remap(atlas, _rows(x), _rows(y), cv2.INTER_LINEAR)
-    return np.asarray(found, np.float32).reshape(-1)[: len(u)]
-
-
-def _rows(values: Floats) -> Tile:
-    """A vector as an image, which is what remap wants: sides below 32768."""
-    missing = _ROW - len(values) % _ROW
-    return np.pad(values.astype(np.float32), (0, missing)).reshape(-1, _ROW)
-
-
 @lru_cache(maxsize=1)
-def _atlas() -> tuple[Tile, NDArray[np.float32]]:
-    """All patterns below each other, the levels side by side, and where each level starts.
+def atlas() -> Tile:
+    """All patterns below each other, the levels side by side; drawn when first asked for.
 
     Every level carries its first row and column again at its end, so that interpolation wraps.
     """
     sides = [SIDE >> level for level in range(LEVELS)]
-    starts = np.cumsum([0, *(side + 1 for side in sides)])
     rows = []
     for kind, count in KINDS.items():
         for number in range(count):
             rng = np.random.default_rng([_SEED, sum(kind.encode()), number])
             rows.append(_with_levels(_PAINTERS[kind](rng), sides))
-    return np.concatenate(rows), starts[:-1].astype(np.float32)
+    return np.concatenate(rows)
 
 
 def _with_levels(tile: Tile, sides: list[int]) -> Tile:

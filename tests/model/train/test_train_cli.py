@@ -534,7 +534,7 @@ def test_a_run_goes_on_with_its_own_generator_alone(
     assert train([*given, "1", *more]) == 0
     record = json.loads((tmp_path / "record.json").read_text())
     assert record["data"].startswith("streets v")
-    assert record["versions"].keys() >= {"opencv-python-headless", "embreex"}
+    assert record["versions"].keys() >= {"opencv-python-headless", "numba"}
     monkeypatch.setattr("rts2.model.data.streets.VERSION", 999)
     capsys.readouterr()
     assert train([*given, "1", *more]) == 2

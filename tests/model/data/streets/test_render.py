@@ -1,24 +1,23 @@
 """Known surfaces: what they must measure, hide, show and reflect."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from rts2.model.data.streets import paint, render, shapes
-from rts2.model.data.streets.render import Camera, Light, World
+from rts2.model.data.streets.render import World
+from rts2.model.data.streets.shading import Camera, Light
 from rts2.model.data.streets.soup import Soup
 
-CAMERA = Camera(focal_px=100.0, centre=(31.5, 15.5), size=(64, 32), baseline_m=0.5)
-LEFT, RIGHT = np.zeros(3), np.array([0.5, 0, 0])
+LEFT = Camera(focal_px=100.0, centre=(31.5, 15.5), size=(64, 32))
+RIGHT = LEFT._replace(x_m=0.5)
 LIGHT = Light(
-    sun=np.array([0, -1, 0], np.float32),
-    up=np.array([0, -1, 0], np.float32),
+    sun=(0.0, -1.0, 0.0),
+    up=(0.0, -1.0, 0.0),
     strength=0.0,
-    warmth=np.ones(3, np.float32),
-    ambient=np.ones(3, np.float32),
-    zenith=np.ones(3, np.float32),
-    horizon=np.ones(3, np.float32),
+    warmth=(1.0, 1.0, 1.0),
+    ambient=(1.0, 1.0, 1.0),
+    zenith=(1.0, 1.0, 1.0),
+    horizon=(1.0, 1.0, 1.0),
     clouds=0.0,
     cloud_pattern=0,
     haze=0.0,
@@ -55,13 +54,13 @@ def sheet(z: float, left: float, right: float, far_z: float | None = None) -> sh
 
 def seen(scene: World) -> tuple[render.Hits, np.ndarray, np.ndarray]:
     """What both eyes see, as maps: left hits, left disparity, visibility."""
-    x, y = CAMERA.grid()
-    rays = CAMERA.rays(x, y)
-    hits, _ = render.look(scene, rays, LEFT, CAMERA.focal_px)
-    other, _ = render.look(scene, rays, RIGHT, CAMERA.focal_px)
-    visible = render.visible(scene, hits, other, rays, CAMERA, x)
-    disparity = CAMERA.focal_px * CAMERA.baseline_m / hits.depth
-    return hits, disparity.reshape(32, 64), visible.reshape(32, 64)
+    hits = render.see(scene, LEFT)
+    return hits, 100 * 0.5 * hits.nearness, render.visible(scene, hits, LEFT, RIGHT)
+
+
+def colours(scene: World) -> np.ndarray:
+    """The left eye's image."""
+    return render.look(scene, [LEFT], [render.see(scene, LEFT)])[0]
 
 
 def test_disparity_of_a_wall_is_focal_times_baseline_over_depth() -> None:
@@ -77,14 +76,16 @@ def test_disparity_of_a_slanted_wall_is_linear_in_x() -> None:
 
 
 def test_sky_is_infinitely_far_and_has_a_label() -> None:
+    """The wall starts at column 31.5 of the left eye, at 25.25 of the right one."""
     scene = world(sheet(8.0, 0, 50))
     hits, disparity, visible = seen(scene)
     labels, things = render.labels(scene, hits)
     assert (disparity[:, :32] == 0).all()
-    assert (labels.reshape(32, 64)[:, :32] == 10).all()
-    assert (things.reshape(32, 64)[:, :32] == 0).all()
-    assert (things.reshape(32, 64)[:, 32:] == 1).all()
-    assert visible[:, :31].all()
+    assert (labels[:, :32] == 10).all()
+    assert (things[:, :32] == 0).all()
+    assert (things[:, 32:] == 1).all()
+    assert visible[:, :26].all()
+    assert not visible[:, 26:32].any()
 
 
 def test_a_post_hides_the_wall_to_its_left() -> None:
@@ -115,13 +116,11 @@ def test_light_falls_by_slope_and_shadow() -> None:
     ground = np.array([[[-50, 1, 1], [50, 1, 1], [50, 1, 80], [-50, 1, 80]]], float)
     roof = ground.copy()
     roof[..., 1] = -60
-    sunny = replace(LIGHT, strength=0.8)
-    x, y = np.array([31.5], np.float32), np.array([30.5], np.float32)
-    rays = CAMERA.rays(x, y)
+    sunny = LIGHT._replace(strength=0.8)
 
     def brightness(*sheets: np.ndarray, light: Light) -> float:
         flat = [shapes.quads(corners, np.zeros((1, 4, 2))) for corners in sheets]
-        return float(render.look(world(*flat, light=light), rays, LEFT, 100)[1][0, 0])
+        return float(colours(world(*flat, light=light))[30, 31, 0])
 
     assert brightness(ground, light=LIGHT) == pytest.approx(0.5, rel=1e-4)
     assert brightness(ground, light=sunny) == pytest.approx(0.5 * 1.8, rel=1e-4)
@@ -129,8 +128,7 @@ def test_light_falls_by_slope_and_shadow() -> None:
 
 
 def test_haze_leaves_the_horizons_light() -> None:
-    light = replace(LIGHT, haze=0.05, horizon=np.full(3, 2.0, np.float32))
-    x, y = CAMERA.grid()
-    colours = render.look(world(sheet(10.0, -50, 50), light=light), CAMERA.rays(x, y), LEFT, 100)[1]
+    light = LIGHT._replace(haze=0.05, horizon=(2.0, 2.0, 2.0))
     kept = np.exp(-0.05 * 10)
-    assert colours == pytest.approx(0.5 * 0.55 * kept + 2 * (1 - kept), rel=1e-4)
+    image = colours(world(sheet(10.0, -50, 50), light=light))
+    assert image == pytest.approx(0.5 * 0.55 * kept + 2 * (1 - kept), rel=1e-4)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from rts2.model.data.streets import sensor, textures
+from rts2.model.data.streets import sensor, shading, textures
 
 
 def values(pattern: int, u: np.ndarray, v: np.ndarray, texels: float) -> np.ndarray:
-    numbers = np.full(u.size, pattern)
-    return textures.sample(numbers, u.ravel(), v.ravel(), np.full(u.size, texels)).reshape(u.shape)
+    atlas, places = textures.atlas(), zip(u.ravel(), v.ravel(), strict=True)
+    return np.array([shading.value(atlas, pattern, *at, texels) for at in places]).reshape(u.shape)
 
 
 @pytest.mark.parametrize("kind", textures.KINDS)
