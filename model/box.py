@@ -6,8 +6,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
+from pydantic import BaseModel, ConfigDict
+
 from .arch import Arch
 from .errors import UsageError
+from .files import read_json
 
 DEFAULT: Final = "c8"
 """What runs where no model is given."""
@@ -15,6 +18,39 @@ DEFAULT: Final = "c8"
 SHIPPED: Final = ("c1", "c4", "c8")
 
 SUFFIX: Final = ".safetensors"
+
+JUDGE: Final = "kitti2015"
+"""Whose real frames tell what a network in the box reaches."""
+
+
+class Figures(BaseModel):
+    """What a network reached after `stage` stages; None where nobody knows."""
+
+    model_config = ConfigDict(frozen=True)
+
+    stage: int
+    d1_all: float | None
+    epe: float | None
+    miou: float | None
+
+
+class Judged(BaseModel):
+    """A network's figures on a data set."""
+
+    model_config = ConfigDict(frozen=True)
+
+    dataset: str
+    split: str
+    samples: int
+    stages: tuple[Figures, ...]
+
+
+class Record(BaseModel):
+    """What stands beside a network in the box, as far as it is asked."""
+
+    model_config = ConfigDict(frozen=True)
+
+    judged: tuple[Judged, ...]
 
 
 def named_model(text: str) -> Path:
@@ -53,6 +89,29 @@ def holding(arch: Arch) -> Path | None:
         path = _folder() / f"{name}{SUFFIX}"
         if not arch.missing_from(read_header(path).arch):
             return path
+    return None
+
+
+def in_box(path: Path) -> bool:
+    """Whether the file is a network in the box."""
+    return path.parent == _folder()
+
+
+def judged(path: Path, arch: Arch) -> tuple[Figures, str] | None:
+    """What a network in the box, cut to `arch`, reaches on `JUDGE`, and what was judged, in words.
+
+    None where its record does not tell: it was judged whole, and stopped after each stage.
+    """
+    from .checkpoint import read_header
+
+    record = path.with_suffix(".json")
+    whole = read_header(path).arch
+    if not record.is_file() or arch.stages > whole.stages or arch != whole.up_to(arch.stages):
+        return None
+    for each in read_json(record, Record, "the record of a network in the box").judged:
+        for figures in each.stages:
+            if (each.dataset, figures.stage) == (JUDGE, arch.stages):
+                return figures, f"{each.dataset} {each.split}, {each.samples} frames, in fp32"
     return None
 
 

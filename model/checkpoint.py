@@ -6,6 +6,7 @@ import pickle
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from pydantic import BaseModel, ConfigDict
@@ -20,6 +21,7 @@ from .files import existing_file, parse_json, replacing
 from .rts2net import RTS2Net
 
 Network = RTS2Net | AnyNet
+Schema = TypeVar("Schema", bound=BaseModel)
 
 HEADER = "rts2"
 """The key of our entry in the safetensors header."""
@@ -103,7 +105,7 @@ def not_finite(network: nn.Module) -> list[str]:
 
 def read_header(path: Path) -> Header:
     """What a checkpoint of ours says of itself, without its weights; raises as `load` does."""
-    return _read_own(path, weights=False)[0]
+    return _read_own(path, tensors=False)[0]
 
 
 def _load_own(path: Path) -> tuple[Network, Header]:
@@ -113,20 +115,28 @@ def _load_own(path: Path) -> tuple[Network, Header]:
     return network, header
 
 
-def _read_own(path: Path, weights: bool = True) -> tuple[Header, dict[str, Tensor]]:
+def _read_own(path: Path, tensors: bool = True) -> tuple[Header, dict[str, Tensor]]:
+    remedy = "rts2 reads the checkpoints that rts2 writes, and AnyNet's released ones"
+    return read_stored(path, HEADER, Header, f"arch; {remedy}", tensors)
+
+
+def read_stored(
+    path: Path, entry: str, schema: type[Schema], lacking: str, tensors: bool = True
+) -> tuple[Schema, dict[str, Tensor]]:
+    """Our entry in a safetensors file's header, validated, and the file's tensors if wanted.
+
+    `lacking` tells what a file without the entry holds none of, and what to do. Raises
+    `Rts2Error` for such a file and for a broken one.
+    """
     try:
         with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get(HEADER)
-            if header is None:
-                raise Rts2Error(
-                    f"{path} holds no arch; rts2 reads the checkpoints that rts2 writes, "
-                    "and AnyNet's released ones"
-                )
-            names = file.keys() if weights else ()
-            tensors = {name: file.get_tensor(name) for name in names}
+            text = (file.metadata() or {}).get(entry)
+            if text is None:
+                raise Rts2Error(f"{path} holds no {lacking}")
+            found = {name: file.get_tensor(name) for name in (file.keys() if tensors else ())}
     except (SafetensorError, OSError) as error:
         raise Rts2Error(f"{path} is truncated or no safetensors file: {error}") from error
-    return parse_json(header, Header, f"the header of {path}"), tensors
+    return parse_json(text, schema, f"the header of {path}"), found
 
 
 def _import_anynet(path: Path) -> tuple[Network, Header]:

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from .data.images import Bytes, Disparity
+from .data.labels import CLASS_NAMES
 
 BRIGHTEST: Final = 98
 """The percentile of a disparity map that its colours end at, unless a maximum is given."""
@@ -66,6 +67,20 @@ def overlay(image: Bytes, semantic: Bytes, share: float = 0.5) -> Bytes:
         (semantic < len(PALETTE))[..., None], image * (1 - share) + classes * share, image
     )
     return np.rint(mixed).astype(np.uint8)
+
+
+def legend() -> Bytes:
+    """(H, W, 3) RGB: the name of each class beside its colour, in two columns."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    rows, height, width = -(-len(CLASS_NAMES) // 2), 28, 170
+    picture = Image.new("RGB", (2 * width, rows * height + 8), "white")
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(16)
+    for train_id, name in enumerate(CLASS_NAMES):
+        x, y = train_id // rows * width + 8, train_id % rows * height + 6
+        draw.rectangle((x, y, x + 40, y + height - 6), fill=tuple(PALETTE[train_id].tolist()))
+        draw.text((x + 50, y + (height - 6) / 2), name, "black", font, anchor="lm")
+    return np.asarray(picture)
 
 
 def _full_palette() -> Bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -13,20 +13,15 @@ from . import folder as plain
 from .frame import Frame
 from .layout import chosen, read_names
 from .scene import Sample
-from .streets import Look, Streets
+from .streets import VAL_SEED, Look, Streets
 
 STREETS: Final = "streets"
 
 ALL: Final = "all"
 """The split of every frame with truth; a list file chooses from it."""
 
-VAL_SEED: Final = 2**32 - 1
-"""The seed of the streets that judge; no training may take it."""
-
 STREETS_COUNT: Final[Mapping[str, int]] = {"train": 10_000, "val": 200}
 """How many streets a split has unless told."""
-
-STREETS_MOST: Final = 1_000_000
 
 STREETS_SIZE: Final = (1242, 375)
 
@@ -125,6 +120,20 @@ DATASETS: Final[Mapping[str, Dataset]] = {
 """What --dataset takes. A new data set is one more row."""
 
 
+def require_generated(name: str, given: Iterable[str]) -> None:
+    """Raises `UsageError` where an option of `given` is not for the data set, as nobody makes it.
+
+    `given` names options as their fields are named, `data_seed` for --data-seed.
+    """
+    if not DATASETS[name].has_folder:
+        return
+    for option in given:
+        raise UsageError(
+            f"--{option.replace('_', '-')} is for generated scenes (--dataset {STREETS}), and "
+            f"{name} lies in a folder; leave it out, or give --split a list"
+        )
+
+
 def open_dataset(
     name: str,
     folder: Path | None = None,
@@ -179,8 +188,6 @@ def _streets(
     if split == "train" and seed == VAL_SEED:
         raise UsageError(f"the seed {VAL_SEED} belongs to the streets that judge; take another")
     count = STREETS_COUNT[split] if count is None else count
-    if not 1 <= count <= STREETS_MOST:
-        raise UsageError(f"{STREETS} may be 1 to {STREETS_MOST}, not {count}; change --count")
     return Streets(count, seed if split == "train" else VAL_SEED, size, look)
 
 

@@ -83,15 +83,28 @@ def read_steps(path: Path) -> NDArray[np.float32]:
 
 
 def write_disparity(path: Path, disparity: Disparity) -> int:
-    """Writes a KITTI 16-bit PNG, rounded to 1/256 pixel; what is not finite becomes 0.
+    """Writes a KITTI 16-bit PNG that holds `storable(disparity)`.
 
-    Disparities of nearly 0 and less are stored as 1/256 pixel, KITTI's smallest. Returns how many
-    pixels exceed `LARGEST_PX` and had to be stored as that.
+    Returns how many pixels exceed `LARGEST_PX` and had to be stored as that.
     """
-    known = np.isfinite(disparity)
-    steps = np.rint(np.where(known, disparity, 0).astype(np.float64) * STEPS)
-    write_image(path, np.where(known, steps.clip(1, 65535), 0).astype(np.uint16))
+    steps = _steps(disparity)
+    write_image(path, np.nan_to_num(steps.clip(1, 65535)).astype(np.uint16))
     return int((steps > 65535).sum())
+
+
+def storable(disparity: Disparity) -> Disparity:
+    """What a KITTI 16-bit PNG makes of a map: steps of 1/256 pixel, unknown what is not finite.
+
+    Disparities of nearly 0 and less become 1/256 pixel, KITTI's smallest, those beyond
+    `LARGEST_PX` become that.
+    """
+    return (_steps(disparity).clip(1, 65535) / STEPS).astype(np.float32)
+
+
+def _steps(disparity: Disparity) -> NDArray[np.float64]:
+    """Whole steps, as many as there are; NaN where nothing is known."""
+    known = np.where(np.isfinite(disparity), disparity, np.nan)
+    return np.rint(known.astype(np.float64) * STEPS)
 
 
 def write_image(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ..arch import Arch, arch_from
 from ..box import SHIPPED, named_model
 from ..console import add_output, command, parser, positive, print_json, progress, resolution, seed
-from ..data.catalog import DATASETS
+from ..data.catalog import DATASETS, require_generated
 from ..errors import Rts2Error, UsageError
 from ..files import existing_file, parse_json, read_json, sha256
 from ..machine import cores
@@ -185,16 +185,11 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 def _of_dataset(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """What the data set decides: its k, unless told, and whether its scenes can be counted out."""
     row = DATASETS[values["dataset"]]
+    generated = ("count", "data_seed", "rectification_px")
+    require_generated(values["dataset"], (name for name in generated if name in given))
     found: dict[str, Any] = {"k": values.get("k", row.k) or None}
-    if not row.has_folder:
-        return found
-    for name in ("count", "data_seed", "rectification_px"):
-        if name in given:
-            raise UsageError(
-                f"--{name.replace('_', '-')} is for generated scenes, and "
-                f"{values['dataset']} lies in a folder; leave it out, or give --split a list"
-            )
-    return found | {"count": None}  # the preset's, where it is of generated scenes
+    # The preset's count goes, where it is of generated scenes.
+    return found | {"count": None} if row.has_folder else found
 
 
 def _arch(options: argparse.Namespace, preset: dict[str, Any] | None) -> Arch:

@@ -7,6 +7,7 @@ seed, the epoch and the sample's index alone, never from what was loaded before.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -202,13 +203,27 @@ def loader(
     return DataLoader(
         Prepared(samples, recipe),
         batch_sampler=places,
-        num_workers=workers,
         collate_fn=collated,
-        worker_init_fn=one_thread,
         pin_memory=pin,
         prefetch_factor=PREFETCHED if workers else None,
-        generator=torch.Generator(),  # of the workers' seeds, which nothing here uses
+        **staff(workers),
     )
+
+
+def staff(workers: int) -> dict[str, Any]:
+    """What DataLoader is told of its `workers` processes.
+
+    On Linux they are forked off the process that trains, whatever Python's default is: a worker
+    ends once its parent is gone, and one that a fork server started would outlive a killed run,
+    as server and worker wait for each other. A fork copies the locks of threads; workers use none
+    of the parent's, as each computes on a single thread.
+    """
+    return {
+        "num_workers": workers,
+        "multiprocessing_context": "fork" if workers and sys.platform == "linux" else None,
+        "worker_init_fn": one_thread,
+        "generator": torch.Generator(),  # of the workers' seeds, which nothing here uses
+    }
 
 
 def one_thread(_worker: int) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
@@ -18,7 +17,7 @@ from ..data.scene import Sample, fingerprint
 from ..errors import Rts2Error, UsageError
 from ..metrics import IGNORED
 from .distributed import World
-from .loader import Fault, ended, fault, one_thread, require_labels
+from .loader import Fault, ended, fault, require_labels, staff
 from .recipe import Recipe
 
 Shown = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -74,13 +73,7 @@ def class_shares(
 
 def _counted(counts: LabelCounts, workers: int, shown: Shown) -> NDArray[np.int64]:
     """The pixels of each class in all of the samples."""
-    loader = DataLoader(
-        counts,
-        batch_size=None,
-        num_workers=workers,
-        worker_init_fn=one_thread,
-        generator=torch.Generator(),  # of the workers' seeds, which nothing here uses
-    )
+    loader = DataLoader(counts, batch_size=None, **staff(workers))
     pixels = np.zeros(counts.classes, np.int64)
     try:
         for found in shown(loader, "counting classes", len(counts)):

@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import torch
 from pydantic import BaseModel, ConfigDict
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from ..checkpoint import read_stored
 from ..errors import Rts2Error
-from ..files import parse_json, write_bytes
+from ..files import write_bytes
 from .recipe import Recipe
 
 HEADER: Final = "rts2-train"
@@ -65,16 +65,7 @@ def save_state(
 
 def read_standing(path: Path) -> Standing:
     """Where the run of a state file stands. Raises `Rts2Error` for any other file."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get(HEADER)
-    except (SafetensorError, OSError) as error:
-        raise Rts2Error(
-            f"{path} is truncated or no training state: {error}; start anew in another --out"
-        ) from error
-    if header is None:
-        raise Rts2Error(f"{path} holds no training state; choose another --out")
-    return parse_json(header, Standing, f"the header of {path}")
+    return _read(path, tensors=False)[0]
 
 
 def restore(path: Path, updates: int, network: nn.Module, optimizer: torch.optim.Optimizer) -> None:
@@ -83,12 +74,16 @@ def restore(path: Path, updates: int, network: nn.Module, optimizer: torch.optim
     Values are copied into the tensors that stand, as their layout in memory is part of what makes
     a step exact.
     """
+    _, tensors = _read(path)
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         _fill(tensors, updates, network, optimizer)
-    except (SafetensorError, OSError, KeyError, RuntimeError) as error:
+    except (KeyError, RuntimeError) as error:
         raise Rts2Error(f"{path} does not fit its recipe: {error}") from error
+
+
+def _read(path: Path, tensors: bool = True) -> tuple[Standing, dict[str, Tensor]]:
+    lacking = "training state; choose another --out"
+    return read_stored(path, HEADER, Standing, lacking, tensors)
 
 
 def _fill(

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from rts2.model.arch import Arch
-from rts2.model.box import DEFAULT, SHIPPED, holding, named_model, names
+from rts2.model.box import DEFAULT, SHIPPED, holding, in_box, judged, named_model, names
 from rts2.model.checkpoint import build, save
-from rts2.model.errors import UsageError
+from rts2.model.errors import Rts2Error, UsageError
 
 
 @pytest.fixture
@@ -61,6 +61,22 @@ def test_an_arch_is_found_in_the_network_that_holds_it(box: Path) -> None:
     assert holding(Arch(c=8, stages=2)) == box / "c8.safetensors"
     assert holding(Arch(c=1, semantic=False)) == box / "c1.safetensors"
     assert holding(Arch(c=2)) is None
+
+
+def test_the_record_of_a_broken_box_is_one_line(box: Path) -> None:
+    save(build(Arch(c=8)), box / "c8.safetensors", "trained on nothing")
+    with pytest.raises(Rts2Error, match=r"the record of a network in the box .*c8\.json: "):
+        judged(box / "c8.safetensors", Arch(c=8))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_is_shipped_was_judged_after_every_stage(name: str) -> None:
+    path = named_model(name)
+    assert in_box(path)
+    whole = Arch(c=int(name[1:]))
+    found = [judged(path, whole.up_to(stages)) for stages in (1, 2, 3)]
+    assert [each and each[0].stage for each in found] == [1, 2, 3]
+    assert judged(path, Arch(c=whole.c, refinement=False)) is None
 
 
 def test_the_default_is_shipped() -> None:

@@ -2,10 +2,12 @@
 
 import numpy as np
 from matplotlib import colormaps
+from numpy.lib.stride_tricks import sliding_window_view
 
 from rts2.model.pictures import (
     PALETTE,
     coloured,
+    legend,
     overlay,
     painted,
 )
@@ -51,6 +53,18 @@ def test_classes_have_the_colours_of_cityscapes() -> None:
     assert (road, sky, car) == ([128, 64, 128], [70, 130, 180], [0, 0, 142])
     assert not painted(np.array([[19, 255]], np.uint8)).any()
     assert len({tuple(colour) for colour in PALETTE.tolist()}) == 19
+
+
+def test_the_legend_has_every_colour_and_beside_it_its_name() -> None:
+    picture = legend()
+    names = set()
+    for colour in PALETTE:
+        filled = sliding_window_view((picture == colour).all(2), (20, 40)).all((2, 3))
+        y, x = np.argwhere(filled)[0]
+        beside = picture[y : y + 20, x + 45 : x + 160]
+        assert (beside.min(2) < 64).any(), "a name in black"
+        names.add(beside.tobytes())
+    assert len(names) == 19
 
 
 def test_overlay_mixes_and_leaves_unlabelled_pixels() -> None:

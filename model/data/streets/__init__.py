@@ -29,6 +29,12 @@ CENTRE = (609.559, 172.854)
 NEAREST_M = 2.1
 """Nothing that stands on the street comes closer: 185 pixels of disparity in KITTI's frames."""
 
+MOST = 1_000_000
+"""So many scenes a seed has at most."""
+
+VAL_SEED = 2**32 - 1
+"""The seed of the streets that judge; no training may take it."""
+
 VERSION = 3
 """Another generator makes other scenes."""
 
@@ -55,7 +61,7 @@ class Street:
 
     @property
     def name(self) -> str:
-        return f"{self.seed}-{self.index:06d}"
+        return f"{'val' if self.seed == VAL_SEED else self.seed}-{self.index:06d}"
 
     @property
     def foreground(self) -> Foreground:
@@ -76,8 +82,8 @@ class Streets(Sequence[Street]):
         size: tuple[int, int] = KITTI_SIZE,
         look: Look | None = None,
     ) -> None:
-        if count < 1:
-            raise UsageError(f"streets needs a count of at least 1, not {count}")
+        if not 1 <= count <= MOST:
+            raise UsageError(f"streets may be 1 to {MOST}, not {count}; change --count")
         self.seed, self.size, self.look = seed, size, look or Look()
         self._range = range(count)
 

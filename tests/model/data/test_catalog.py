@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rts2.model.data.cache import Cached
-from rts2.model.data.catalog import DATASETS, VAL_SEED, open_dataset
+from rts2.model.data.catalog import DATASETS, open_dataset, require_generated
 from rts2.model.data.kitti import open_2015
-from rts2.model.data.streets import Streets
+from rts2.model.data.streets import VAL_SEED, Streets
 from rts2.model.errors import UsageError
 
 
@@ -70,6 +70,19 @@ def test_wrong_requests_are_one_line(kitti: Path) -> None:
         open_dataset("streets", split="all")
     with pytest.raises(UsageError, match="leave out --data"):
         open_dataset("streets", kitti)
+
+
+def test_an_option_of_generated_scenes_is_refused_where_nobody_makes_them() -> None:
+    require_generated("streets", ["count", "data_seed"])
+    require_generated("kitti2015", [])
+    with pytest.raises(UsageError, match=r"--data-seed is for generated scenes .*kitti2015 lies"):
+        require_generated("kitti2015", ["data_seed", "count"])
+
+
+def test_streets_that_judge_are_called_so() -> None:
+    judging, training = (open_dataset("streets", split=s, count=8) for s in ("val", "train"))
+    assert [sample.name for sample in judging[:2]] == ["val-000000", "val-000001"]
+    assert training[7].name == "0-000007"
 
 
 def test_streets_that_judge_never_train() -> None:

@@ -12,6 +12,7 @@ from rts2.model.data.images import (
     read_rgb,
     read_whole,
     require_same_size,
+    storable,
     write_disparity,
     write_image,
     write_indexed,
@@ -33,6 +34,7 @@ def test_disparity_is_rounded_and_saturates(tmp_path: Path) -> None:
     # 0.0059 px is 1.51 steps: rounded 2, truncated it would be 1.
     assert stored.tolist() == [[0, 0, 1, 1], [2, 256, 65535, 65535]]
     assert saturated == 1
+    np.testing.assert_array_equal(storable(disparity), read_disparity(tmp_path / "d.png"))
 
 
 def test_disparity_of_zero_is_unknown(tmp_path: Path) -> None:

@@ -1,7 +1,10 @@
 """The endless line of samples, and what a place of it gives."""
 
+import multiprocessing
+import os
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -68,6 +71,32 @@ def test_workers_change_nothing(pairs: Path) -> None:
     assert all(same(a, b) for a, b in zip(alone, many, strict=True))
 
 
+@dataclass(frozen=True)
+class Family:
+    """A sample that is named by its process's parent."""
+
+    size: tuple[int, int] = (64, 32)
+    foreground: None = None
+
+    @property
+    def name(self) -> str:
+        return str(os.getppid())
+
+    def read(self) -> Scene:
+        return replace(PLAIN, name=self.name)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere forks are not safe")
+def test_workers_are_children_of_the_process_that_trains() -> None:
+    """They end with their parent; those of a fork server, Python 3.14's default, would stay."""
+    multiprocessing.set_start_method("forkserver", force=True)
+    try:
+        found = batches([Family()], recipe(batch=1), workers=2)
+    finally:
+        multiprocessing.set_start_method(None, force=True)
+    assert {name for batch in found for name in batch.names} == {str(os.getpid())}
+
+
 def test_a_step_is_the_same_from_wherever_one_starts(pairs: Path) -> None:
     samples = open_dataset("folder", pairs)
     whole, rest = batches(samples, recipe()), batches(samples, recipe(), first=2)
@@ -129,6 +158,8 @@ def given(truth: float = 5, label: int | None = 3, size: tuple[int, int] = (64, 
         Scene("given", image, image, np.full((height, width), truth, np.float32), semantic=labels)
     )
 
+
+PLAIN = given().scene
 
 FAULTS = {
     "no truth": (given(truth=np.nan), "known disparities: given has none", False),

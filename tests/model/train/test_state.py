@@ -98,7 +98,7 @@ def test_broken_and_foreign_files_are_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for length in (0, 5, 3000, len(whole) - 1):
         path.write_bytes(whole[:length])
-        with pytest.raises(Rts2Error, match="truncated or no training state"):
+        with pytest.raises(Rts2Error, match="truncated or no safetensors file"):
             read_standing(path)
     save(build(RECIPE.arch), path, "a test")
     with pytest.raises(Rts2Error, match="holds no training state"):

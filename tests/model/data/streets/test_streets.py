@@ -172,5 +172,5 @@ def test_samples_are_listed_like_any_sequence() -> None:
         streets[5]
     prints = {Streets(5, seed, size).fingerprint for seed in (1, 2) for size in (WINDOW, (64, 64))}
     assert len(prints) == 4
-    with pytest.raises(UsageError, match="at least 1, not 0"):
+    with pytest.raises(UsageError, match="streets may be 1 to 1000000, not 0"):
         Streets(0, 1)
