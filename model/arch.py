@@ -11,7 +11,7 @@ from .files import first_fault
 
 Family = Literal["rts2net", "anynet"]
 Branches = Literal["disparity", "disparity+semantic", "full"]
-Precision = Literal["fp32", "fp16", "int8"]
+Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 UNTRAINED = "untrained"
 """The origin of random weights."""
@@ -100,7 +100,7 @@ class Arch(BaseModel):
 
     def up_to(self, stages: int | None) -> Arch:
         """The arch stopped early after `stages` stages (all of them for None)."""
-        if stages is None:
+        if stages in (None, self.stages):
             return self
         if not 1 <= stages <= self.stages:
             raise UsageError(f"stages must be 1 to {self.stages} for this network, not {stages}")

@@ -26,12 +26,13 @@ from .console import (
     screen,
     seed,
 )
-from .data.catalog import DATASETS, STREETS, open_dataset
+from .data.catalog import DATASETS, STREETS, open_dataset, require_generated
 from .data.images import (
     LARGEST_PX,
     image_size,
     read_rgb,
     require_same_size,
+    storable,
     write_disparity,
     write_image,
     write_indexed,
@@ -40,7 +41,7 @@ from .data.layout import IMAGES, images_of
 from .data.scene import Sample, fingerprint, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
-from .pictures import PALETTE, coloured, overlay
+from .pictures import PALETTE, coloured, legend, overlay
 from .submission import Part, finish, new_folder, write_frame
 
 if TYPE_CHECKING:
@@ -80,6 +81,9 @@ TITLES = {
 }
 """The columns of rts2-eval's table, by figure."""
 
+LEGEND = "classes.png"
+"""Which colour of a picture is which class, once for all pairs of a folder."""
+
 SHOWN_IMAGES = 20
 """With more images than this the table has the totals alone."""
 
@@ -112,16 +116,26 @@ def infer(arguments: Sequence[str] | None = None) -> int:
     predictor = _open(options.model)
     _warm(predictor, pairs, options.stages)
     folder = output_folder(options.out)
-    results = []
+    results, legend_file = [], None
     for pair in progress(pairs, "pairs", len(pairs)):
         left, right = read_rgb(pair.left), read_rgb(pair.right)
         estimate = predictor.predict(left, right, options.stages)
         files = _write(folder, pair.name, left, estimate, calibration, options.max_disparity)
         results.append(_summary(pair, estimate, files))
+        if estimate.semantic is not None and legend_file is None:
+            legend_file = LEGEND
+            write_image(folder / LEGEND, legend())
     if options.json:
-        print_json({"schema": "rts2.infer/1", **_about(options.model, predictor), "pairs": results})
+        print_json(
+            {
+                "schema": "rts2.infer/1",
+                **_about(options.model, predictor),
+                "legend": legend_file,
+                "pairs": results,
+            }
+        )
     else:
-        _show_pairs(results, options.model, predictor, folder)
+        _show_pairs(results, legend_file, _title(options.model, predictor), folder)
     return 0
 
 
@@ -172,10 +186,9 @@ def _judged(
 
 def _samples(options: argparse.Namespace) -> Sequence[Sample]:
     """The data set that the options name; what cannot be judged shows before a network runs."""
-    generated = {name: getattr(options, name) for name in ("count", "size", "seed")}
-    given = [name for name, value in generated.items() if value is not None]
-    if given and options.dataset != STREETS:
-        raise UsageError(f"--{given[0]} is for --dataset {STREETS}; {options.dataset} has its own")
+    generated = ("count", "size", "seed")
+    given = (name for name in generated if getattr(options, name) is not None)
+    require_generated(options.dataset, given)
     if options.seed is not None and options.split != "train":
         raise UsageError("the streets that judge have one seed; --seed is for --split train")
     samples = open_dataset(
@@ -344,8 +357,12 @@ def _write(
 
 
 def _summary(pair: Pair, estimate: Estimate, files: list[str]) -> dict[str, Any]:
-    """One pair's line of the report; a map without a finite disparity has no range."""
-    known = estimate.disparity[np.isfinite(estimate.disparity)]
+    """One pair's line of the report; its range is that of the file, none without a known pixel.
+
+    A network's residuals may lead below 0, where no disparity lies and no file holds one.
+    """
+    known = storable(estimate.disparity)
+    known = known[np.isfinite(known)]
     return {
         "name": pair.name,
         "size": pair.size,
@@ -368,7 +385,7 @@ def _submitted(folder: Path, parts: Sequence[Part]) -> dict[str, Any]:
 
 
 def _show_pairs(
-    results: list[dict[str, Any]], model: Path, predictor: Predictor, folder: Path
+    results: list[dict[str, Any]], legend_file: str | None, title: str, folder: Path
 ) -> None:
     table = _table("pair", "size", "disparity px", "network ms", "files")
     for result in results:
@@ -381,10 +398,10 @@ def _show_pairs(
             " ".join(name.removeprefix(f"{result['name']}_") for name in result["files"]),
         )
     console = screen()
-    console.print(_title(model, predictor))
+    console.print(title)
     console.print(table)
     console.print("network ms: one run each, the first of each size after a warm-up")
-    console.print(f"written   {folder}/  NAME_…")
+    console.print(f"written   {folder}/  NAME_…  {legend_file or ''}".rstrip(), soft_wrap=True)
 
 
 def _show_scores(report: dict[str, Any], title: str, parts: Sequence[Part]) -> None:

@@ -23,3 +23,15 @@ def processor() -> str:
     title = known.get("model name") or platform.processor() or platform.machine()
     family, model = known.get("cpu family"), known.get("model")
     return f"{title}, family {family}, model {model}" if family and model else title
+
+
+def features() -> frozenset[str]:
+    """What the processor says that it can do, in the system's words; empty where it is not told."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if not cpuinfo.exists():
+        return frozenset()
+    for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+        name, _, value = line.partition(":")
+        if name.strip() in ("flags", "Features"):
+            return frozenset(value.split())
+    return frozenset()

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arch import MEAN, STD, Arch
+from .bundle import graph_of
 from .data.images import Bytes, Disparity
 from .errors import Rts2Error, UsageError
 from .files import existing_file, parse_json
 from .graph import HEADER, GraphHeader
+from .inference import open_session
 from .ops import padded
 
 if TYPE_CHECKING:
@@ -67,13 +69,13 @@ class Predictor(Protocol):
 
 
 def open_model(path: Path) -> Predictor:
-    """A network from an ONNX file, a checkpoint of ours, or a released AnyNet checkpoint.
+    """A network from an ONNX file, a bundle, a checkpoint of ours, or AnyNet's released one.
 
     Raises:
         UsageError: there is no such file.
         Rts2Error: the file is broken, or holds no network that takes a stereo pair.
     """
-    existing_file(path, "a model (a checkpoint or an ONNX file)")
+    path = existing_file(graph_of(path), "a model (a checkpoint or an ONNX file)")
     if path.suffix.lower() == ".onnx":
         return OnnxPredictor(path)
     from .checkpoint import load
@@ -139,7 +141,7 @@ class OnnxPredictor:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.session = _session(path)
+        self.session = open_session(path)
         self.size = _input_size(self.session, path)
         self.outputs = _outputs(self.session, self.size, path)
         header = _header(self.session, path)
@@ -212,17 +214,6 @@ def _cut_back(
     height, width = image.shape[:2]
     labels = None if semantic is None else semantic[0, :height, :width].astype(np.uint8)
     return Estimate(disparity[:height, :width].astype(np.float32), labels, seconds, stage)
-
-
-def _session(path: Path) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what is wrong is raised, and told once
-    try:
-        return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's errors share no other base
-        raise Rts2Error(f"{path} is truncated or no ONNX file: {error}") from error
 
 
 def _input_size(session: Any, path: Path) -> tuple[int, int]:

@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..model.errors import UsageError
+from ..model.errors import Rts2Error, UsageError
 from ..model.files import parse_json
+from .profile import RuntimeSupport
 
 Type = Literal["fp32", "fp16", "int8", "int32", "bool"]
 
@@ -57,6 +58,21 @@ def load_opset(name: str) -> OpSet:
 def unsupported(op_types: Iterable[str], opset: OpSet) -> list[str]:
     """Those of `op_types` that the runtime does not take, sorted, each once."""
     return sorted(set(op_types) - opset.operators.keys())
+
+
+def refuse_operators(path: Path, support: RuntimeSupport) -> None:
+    """Raises `Rts2Error` naming each operator of the graph that the runtime does not take."""
+    if support.operators is None:
+        return
+    table = load_opset(support.operators)
+    version, used = operators(path)
+    missing = unsupported(used, table)
+    if version > table.max_opset or missing:
+        what = ", ".join(missing) or f"opset {version}"
+        raise Rts2Error(
+            f"{table.name} takes opset {table.max_opset} at most and its own operators; "
+            f"the graph needs {what}"
+        )
 
 
 def operators(path: Path) -> tuple[int, list[str]]:

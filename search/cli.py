@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from ..model.arch import UNTRAINED, Precision
-from ..model.box import holding, listed, named_model
+from ..model.box import holding, in_box, judged, listed, named_model
 from ..model.console import (
     KITTI,
     add_output,
@@ -23,10 +23,12 @@ from ..model.console import (
 )
 from ..model.errors import NothingFeasible, UsageError
 from ..model.files import filling_folder, output_folder, remove, write_bytes, write_json
+from ..model.machine import cores
+from ..profiles.here import differences
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import source
 from .deploy.bundle import next_step, runtime_of, stale, write
-from .deploy.configuration import Deployment, of_arch, of_point
+from .deploy.configuration import Deployment, as_judged, of_arch, of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
 from .result import Found, Task, read
@@ -42,6 +44,7 @@ def search(arguments: Sequence[str] | None = None) -> int:
     profile = load(options.device)
     out = output_folder(options.out)
     found = search_all(_question(options, profile), source(options.accuracy))
+    _warn_of_differences(profile, options.device)
     written = _write(found, profile, out)
     if options.json:
         print_json(found.model_dump(mode="json", by_alias=True))
@@ -52,6 +55,18 @@ def search(arguments: Sequence[str] | None = None) -> int:
     if found.selected is None:
         raise NothingFeasible(_infeasible(found, profile))
     return 0
+
+
+def _warn_of_differences(profile: Profile, device: str) -> None:
+    """What a profile was timed with that this machine is not, if it is of a machine at hand."""
+    if profile.machine is None:
+        return
+    told = differences(profile.machine, cores())
+    for difference in told:
+        logging.getLogger(__name__).warning("note: %s", difference)
+    if told:
+        text = "note: rts2-profile fit --device %s --out FILE.json times this machine as it is"
+        logging.getLogger(__name__).warning(text, device)
 
 
 def _search_parser() -> argparse.ArgumentParser:
@@ -145,10 +160,14 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
     options = _deploy_parser().parse_args(arguments)
     profile = load(options.device)
     asked = _asked(options, profile)
-    network, origin = _weights(options, asked)
+    path = options.model or (None if options.untrained else _boxed(asked))
+    network, origin = _weights(path, options, asked)
     if asked is None:
         size = options.resolution or KITTI
         asked = of_arch(network.arch, profile, "fp32", runtime_of(profile).runtime, size)
+    elif path is not None and in_box(path) and asked.expected is not None:
+        expected = as_judged(asked.expected, judged(path, asked.arch))
+        asked = asked.model_copy(update={"expected": expected})
     leftover = stale(options.out)
     with filling_folder(options.out, "deployment.json") as folder:
         complete = write(network, asked, profile, origin, folder)
@@ -220,35 +239,45 @@ def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
     return of_point(point, found, profile)
 
 
-def _weights(options: argparse.Namespace, asked: Deployment | None) -> tuple[Network, str]:
-    """The network to deploy and where its weights come from."""
+def _boxed(asked: Deployment | None) -> Path:
+    """The network in the box that holds what the front asks for."""
+    assert asked is not None, "without a model there is a front"
+    path = holding(asked.arch)
+    if path is None:
+        raise UsageError(
+            f"no network in the box holds {asked.arch.label()}; {listed()}: give --model "
+            "CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
+        )
+    return path
+
+
+def _weights(
+    path: Path | None, options: argparse.Namespace, asked: Deployment | None
+) -> tuple[Network, str]:
+    """The network to deploy, random without a path, and where its weights come from."""
     from ..model.checkpoint import build, cut
     from ..model.checkpoint import load as load_checkpoint
 
-    if options.model is not None:
-        network, header = load_checkpoint(options.model)
-        if not header.trained and not options.untrained:
-            raise UsageError(f"{options.model} is untrained; --untrained deploys it all the same")
-        return (cut(network, asked.arch) if asked else network), header.origin
-    assert asked is not None, "without a model there is a front"
-    if not options.untrained:
-        boxed = holding(asked.arch)
-        if boxed is None:
-            raise UsageError(
-                f"no network in the box holds {asked.arch.label()}; {listed()}: give --model "
-                "CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
-            )
-        network, header = load_checkpoint(boxed)
-        logging.getLogger(__name__).warning(
-            "note: the accuracy that the search promises needs the training that it rests on; "
-            "the weights of %s were %s (rts2-eval judges them, rts2-train --init %s goes on)",
-            *(boxed.stem, header.origin, boxed.stem),
-        )
-        return cut(network, asked.arch), f"{boxed.stem} of the box, {header.origin}"
-    import torch
+    if path is None:
+        import torch
 
-    torch.manual_seed(options.seed)
-    return build(asked.arch), UNTRAINED
+        assert asked is not None, "without a model there is a front"
+        torch.manual_seed(options.seed)
+        return build(asked.arch), UNTRAINED
+    network, header = load_checkpoint(path)
+    if not header.trained and not options.untrained:
+        raise UsageError(f"{path} is untrained; --untrained deploys it all the same")
+    if asked is None:
+        return network, header.origin
+    part = cut(network, asked.arch)
+    if options.model is not None:
+        return part, header.origin
+    logging.getLogger(__name__).warning(
+        "note: the accuracy that the search promises needs the training that it rests on; "
+        "the weights of %s were %s (rts2-eval judges them, rts2-train --init %s goes on)",
+        *(path.stem, header.origin, path.stem),
+    )
+    return part, f"{path.stem} of the box, {header.origin}"
 
 
 def _infeasible(found: Found, profile: Profile) -> str:

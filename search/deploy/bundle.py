@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from ...model.arch import UNTRAINED, Precision
 from ...model.errors import Rts2Error, UsageError
 from ...model.files import write_bytes, write_json
-from ...profiles.opset import load_opset, operators, unsupported
+from ...profiles.opset import refuse_operators
 from ...profiles.profile import Profile, RuntimeSupport
+from ...profiles.trtexec import PATH, WORKSPACE_MB
 from .configuration import Check, Deployment, describe, read
 
 if TYPE_CHECKING:
@@ -57,8 +58,8 @@ def trtexec(deployment: Deployment) -> str:
 # at the power mode and clocks that you will use (on a Jetson: nvpmodel -q, jetson_clocks --show).
 set -eu
 cd "$(dirname "$0")"
-TRTEXEC=${{TRTEXEC:-/usr/src/tensorrt/bin/trtexec}}
-"$TRTEXEC" --onnx={MODEL} --saveEngine=model.plan{half} --workspace=1024 \\
+TRTEXEC=${{TRTEXEC:-{PATH}}}
+"$TRTEXEC" --onnx={MODEL} --saveEngine=model.plan{half} --workspace={WORKSPACE_MB} \\
     --timingCacheFile=timing.cache --buildOnly
 "$TRTEXEC" --loadEngine=model.plan{half} --warmUp=500 --duration=10 --iterations=50 \\
     --loadInputs=left:sample_left.bin,right:sample_right.bin \\
@@ -184,25 +185,15 @@ def _export(
     return disparity
 
 
-def refuse_operators(path: Path, support: RuntimeSupport) -> None:
-    """Raises `Rts2Error` naming each operator of the graph that the runtime does not take."""
-    if support.operators is None:
-        return
-    table = load_opset(support.operators)
-    version, used = operators(path)
-    missing = unsupported(used, table)
-    if version > table.max_opset or missing:
-        what = ", ".join(missing) or f"opset {version}"
-        raise Rts2Error(
-            f"{table.name} takes opset {table.max_opset} at most and its own operators; "
-            f"the graph needs {what}"
-        )
-
-
 def _warning(deployment: Deployment) -> str:
     """What the weights do not promise."""
     if deployment.weights == UNTRAINED:
         return "They are random: the frame rate is real, the disparity means nothing."
+    expected = deployment.expected
+    if expected is None or expected.evidence.accuracy is None:
+        return "What accuracy they reach is not known."
+    if expected.judged_on is not None:
+        return f"Accuracies in `deployment.json` are theirs, judged on {expected.judged_on}."
     return "Accuracies in `deployment.json` are those of the search's source, not of these weights."
 
 

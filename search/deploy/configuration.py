@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from ...model.arch import MEAN, STD, Arch, Precision
+from ...model.box import Figures
 from ...model.files import read_json, sha256
 from ...model.ops import padded
+from ...profiles.evidence import Evidence
 from ...profiles.profile import Profile, Resolution, Runtime
-from ..result import Found, PointEvidence
+from ..result import Found
 from ..result import Point as FrontPoint
 
 Triple = tuple[float, float, float]
@@ -48,6 +50,14 @@ class Output(_Frozen):
     meaning: str
 
 
+class ExpectedEvidence(_Frozen):
+    """Where the latency and the accuracies come from."""
+
+    latency: Evidence
+    accuracy: Evidence | None
+    """None where no accuracy is known of the weights."""
+
+
 class Expected(_Frozen):
     """What was promised, of which runtime, and on what evidence."""
 
@@ -60,7 +70,9 @@ class Expected(_Frozen):
     d1_all: float | None
     epe: float | None
     miou: float | None
-    evidence: PointEvidence
+    evidence: ExpectedEvidence
+    judged_on: str | None = None
+    """What measured the accuracies of these very weights; None where nothing did."""
     boundary: str = "one pair, batch 1, the network alone, median latency"
 
 
@@ -113,11 +125,30 @@ def of_point(point: FrontPoint, found: Found, profile: Profile) -> Deployment:
         d1_all=point.d1_all,
         epe=point.epe,
         miou=point.miou,
-        evidence=point.evidence,
+        evidence=ExpectedEvidence(**point.evidence.model_dump()),
     )
     return of_arch(
         point.arch, profile, point.precision, point.runtime, found.resolution
     ).model_copy(update={"target_fps": found.target_fps, "expected": expected})
+
+
+def as_judged(expected: Expected, found: tuple[Figures, str] | None) -> Expected:
+    """The same promise of speed, with the accuracies that the weights at hand were judged to have.
+
+    Without such figures nothing is known of them.
+    """
+    figures, frames = found or (None, None)
+    return expected.model_copy(
+        update={
+            "d1_all": figures and figures.d1_all,
+            "epe": figures and figures.epe,
+            "miou": figures and figures.miou,
+            "judged_on": frames,
+            "evidence": expected.evidence.model_copy(
+                update={"accuracy": "measured" if figures else None}
+            ),
+        }
+    )
 
 
 def of_arch(

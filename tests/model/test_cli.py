@@ -19,6 +19,7 @@ from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, save
 from rts2.model.cli import evaluate, infer
 from rts2.model.data.images import read_disparity, read_rgb, read_whole
+from rts2.model.pictures import legend
 from rts2.model.predictor import Estimate, open_model
 
 Command = Callable[[list[str]], int]
@@ -117,15 +118,16 @@ def test_pair_gives_every_file(
     (pair,) = told["pairs"]
     kinds = ("cloud.ply", "color.png", "disparity.png", "overlay.png", "semantic.png")
     assert sorted(pair["files"]) == [f"0_{kind}" for kind in kinds]
-    assert [path.name for path in left_behind(home)] == sorted(pair["files"])
+    assert told["legend"] == "classes.png"
+    assert [path.name for path in left_behind(home)] == [*sorted(pair["files"]), told["legend"]]
+    np.testing.assert_array_equal(read_rgb(home / "out" / "classes.png"), legend())
 
     left, right = (read_rgb(home / side / "0.png") for side in ("left", "right"))
     expected = open_model(models / "full.safetensors").predict(left, right)
     written = read_disparity(home / "out" / "0_disparity.png")
     np.testing.assert_allclose(written, expected.disparity, atol=0.5 / 256 + 1e-4)
     np.testing.assert_array_equal(read_whole(home / "out" / "0_semantic.png"), expected.semantic)
-    low, high = pair["disparity_px"]
-    assert (low, high) == pytest.approx((expected.disparity.min(), expected.disparity.max()))
+    assert pair["disparity_px"] == [written.min(), written.max()]
     assert pair["size"] == [96, 64]
     assert pair["network_ms"] > 0
     assert b"element vertex 6144\n" in (home / "out" / "0_cloud.ply").read_bytes()
@@ -163,7 +165,18 @@ def test_folders_give_every_pair(
     ]
     told = report(infer, [*arguments, "--stages", "1"], capsys)
     assert [(pair["name"], pair["stage"]) for pair in told["pairs"]] == [("0", 1), ("1", 1)]
+    assert told["legend"] is None, "no classes, no colours to explain"
     assert len(left_behind(home)) == 4
+
+
+def test_a_folder_of_pairs_has_one_legend(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [str(home / "left"), str(home / "right")]
+    rest = ["--model", str(models / "full.safetensors"), "--out", str(home / "out")]
+    assert infer([*folders, *rest]) == 0
+    assert capsys.readouterr().out.rstrip().endswith("NAME_…  classes.png")
+    assert len(left_behind(home)) == 2 * 4 + 1
 
 
 def test_table_tells_what_was_written(
@@ -194,6 +207,38 @@ def test_network_is_warmed_up_and_timed_in_milliseconds(
     told = report(infer, [*folders, "--model", "m.onnx", "--out", str(home / "out")], capsys)
     assert [pair["network_ms"] for pair in told["pairs"]] == [250.0, 250.0]
     assert slow.runs == 3, "two pairs of one size: one warm-up, one run each"
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted"),
+    [
+        ([-3.25, 7.0, 20.125], [1 / 256, 20.125]),  # residuals may lead below 0
+        ([5.001, 300.0, np.nan], [1280 / 256, 65535 / 256]),
+        ([np.nan, np.inf, np.nan], None),
+    ],
+)
+def test_the_range_is_that_of_the_written_file(
+    home: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    values: list[float],
+    wanted: list[float] | None,
+) -> None:
+    class Given:
+        arch = origin = None
+
+        def predict(self, left: np.ndarray, *rest: object) -> Estimate:
+            rows = np.resize(np.array(values, np.float32), left.shape[:2])
+            return Estimate(rows, None, 0.25, None)
+
+    monkeypatch.setattr("rts2.model.predictor.open_model", lambda path: Given())
+    arguments = infer_arguments(home, Path("m.onnx"))
+    assert infer([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["pairs"][0]["disparity_px"] == wanted
+    written = read_disparity(home / "out" / "0_disparity.png")
+    assert infer(arguments) == 0
+    shown = "– – –" if wanted is None else f"{np.nanmin(written):.1f} – {np.nanmax(written):.1f}"
+    assert f" {shown} " in capsys.readouterr().out
 
 
 def test_disparity_beyond_the_format_is_told(
@@ -548,8 +593,8 @@ def test_submission_of_training_frames_says_so(
         (["--dataset", "streets"], 2, "leave out --data"),
         (["--split", "none"], 2, "the splits of kitti2015 are all, train, val, test"),
         (["--split", "test"], 2, "testing"),
-        (["--count", "3"], 2, "--count is for --dataset streets"),
-        (["--seed", "3"], 2, "--seed is for --dataset streets"),
+        (["--count", "3"], 2, "--count is for generated scenes (--dataset streets)"),
+        (["--seed", "3"], 2, "--seed is for generated scenes"),
         (["--dataset", "streets", "--seed", "3"], 2, "--seed is for --split train"),
         (["--submission", "s", "--crop", "48x32"], 2, "leave --crop out"),
         (["--submission", "s", "--dataset", "streets"], 2, "leave out --data"),

@@ -5,7 +5,7 @@ import platform
 
 import pytest
 
-from rts2.model.machine import cores, processor
+from rts2.model.machine import cores, features, processor
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,3 +35,21 @@ def test_a_processor_is_named(what: str, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("pathlib.Path.read_text", lambda _path, encoding: text)
     monkeypatch.setattr(platform, "processor", lambda: "what the system says")
     assert processor() == name
+
+
+@pytest.mark.parametrize(
+    ("text", "known"),
+    [
+        ("model name : A\nflags\t\t: fpu avx512_bf16\nflags : other\n", {"fpu", "avx512_bf16"}),
+        ("Features : fp asimdhp\n", {"fp", "asimdhp"}),
+        ("processor : 0\n", set()),
+    ],
+)
+def test_features_are_those_that_the_system_tells(
+    monkeypatch: pytest.MonkeyPatch, text: str, known: set[str]
+) -> None:
+    monkeypatch.setattr("pathlib.Path.exists", lambda _path: True)
+    monkeypatch.setattr("pathlib.Path.read_text", lambda _path, encoding: text)
+    assert features() == known
+    monkeypatch.setattr("pathlib.Path.exists", lambda _path: False)
+    assert features() == set()

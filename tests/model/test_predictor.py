@@ -1,5 +1,6 @@
 """Any network runs on numpy images in one way, and says what the network itself says."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from onnx import TensorProto, helper
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, load, save
 from rts2.model.errors import Rts2Error, UsageError
+from rts2.model.files import sha256
 from rts2.model.predictor import (
     OnnxPredictor,
     TorchPredictor,
@@ -180,6 +182,15 @@ def test_exported_graph_says_what_the_checkpoint_says(tmp_path: Path) -> None:
     assert (found.semantic == expected.semantic).mean() > 0.999
     with pytest.raises(UsageError, match="always runs 2 stages, not 3"):
         predictor.predict(*pair(), 3)
+
+
+def test_a_bundle_opens_as_its_graph(tmp_path: Path) -> None:
+    path = graph(tmp_path / "model.onnx")
+    described = {"name": path.name, "sha256": sha256(path)}
+    known = {"schema": "rts2.deployment/1", "files": [described]}
+    (tmp_path / "deployment.json").write_text(json.dumps(known))
+    expected = open_model(path).predict(*pair()).disparity
+    assert np.array_equal(open_model(tmp_path).predict(*pair()).disparity, expected)
 
 
 def test_nameless_graph_has_no_stages_to_choose(tmp_path: Path) -> None:

@@ -20,10 +20,10 @@ from rts2.model.arch import Arch, Precision
 from rts2.model.checkpoint import build
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.graph import read_header
-from rts2.profiles.opset import load_opset, operators
+from rts2.profiles import opset
+from rts2.profiles.opset import load_opset, operators, refuse_operators
 from rts2.profiles.profile import Profile, Runtime, load
-from rts2.search.deploy import bundle
-from rts2.search.deploy.bundle import next_step, refuse_operators, runtime_of, trtexec, write
+from rts2.search.deploy.bundle import next_step, runtime_of, trtexec, write
 from rts2.search.deploy.configuration import Deployment, of_point, read
 from rts2.search.result import Coverage, Found, Point, PointEvidence
 
@@ -417,11 +417,11 @@ def test_operators_that_the_runtime_lacks_are_all_named(
     refuse_operators(path, support)
     table = load_opset("tensorrt-8.2")
     few = {name: op for name, op in table.operators.items() if name not in ("Conv", "Softmax")}
-    monkeypatch.setattr(bundle, "load_opset", lambda _: table.model_copy(update={"operators": few}))
+    monkeypatch.setattr(opset, "load_opset", lambda _: table.model_copy(update={"operators": few}))
     with pytest.raises(Rts2Error, match="the graph needs Conv, Softmax") as error:
         refuse_operators(path, support)
     assert error.value.exit_code == 1
-    monkeypatch.setattr(bundle, "load_opset", lambda _: table.model_copy(update={"max_opset": 12}))
+    monkeypatch.setattr(opset, "load_opset", lambda _: table.model_copy(update={"max_opset": 12}))
     with pytest.raises(Rts2Error, match=r"opset 12 at most .* needs opset 13"):
         refuse_operators(path, support)
 

@@ -250,6 +250,74 @@ def test_a_pick_takes_its_weights_from_the_box(
     assert "the accuracy that the search promises needs the training" in caplog.text
 
 
+FIGURES = {"d1_all": 40.5, "epe": 3.5, "miou": 12.25, "pacc": 60.0}
+"""Of the second stage, as a record tells them."""
+
+
+@pytest.fixture
+def box(
+    checkpoint: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Path]:
+    """A box of one network, judged after each stage on frames that nobody trained on."""
+
+    def fill(dataset: str = "kitti2015") -> Path:
+        path = tmp_path / "box" / "mine.safetensors"
+        path.parent.mkdir()
+        checkpoint(WHOLE).rename(path)
+        stages = [FIGURES | {"stage": stage, "d1_all": 38.5 + stage} for stage in (1, 2, 3)]
+        judged = {"dataset": dataset, "split": "all", "samples": 3, "stages": stages}
+        other = judged | {"dataset": "streets", "stages": [FIGURES | {"stage": 2, "epe": 9.0}]}
+        path.with_suffix(".json").write_text(json.dumps({"judged": [other, judged]}))
+        monkeypatch.setattr("rts2.model.box._folder", lambda: path.parent)
+        return path
+
+    return fill
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_weights_of_the_box_promise_what_they_were_judged_to_reach(
+    run: Any, front: Callable[..., Path], box: Callable[..., Path], named: bool
+) -> None:
+    path = box()
+    more = ("--model", path) if named else ()
+    ended = run("--device", "cpu", "--front", front("cpu"), *more, "--json")
+    told = json.loads(ended.out)["expected"]
+    assert {name: told[name] for name in ("d1_all", "epe", "miou")} == {
+        name: FIGURES[name] for name in ("d1_all", "epe", "miou")
+    }
+    assert told["evidence"] == {"latency": "interpolated", "accuracy": "measured"}
+    assert told["judged_on"] == "kitti2015 all, 3 frames, in fp32"
+    assert (told["fps"], told["latency_ms"]) == (25, 40)
+    text = (ended.folder / "README.md").read_text()
+    assert "theirs, judged on kitti2015 all, 3 frames" in text
+
+
+@pytest.mark.parametrize("why", ["no record", "another data set", "a branch was cut"])
+def test_what_nobody_judged_of_the_box_is_not_promised(
+    run: Any, front: Callable[..., Path], box: Callable[..., Path], why: str
+) -> None:
+    path = box("kitti2012" if why == "another data set" else "kitti2015")
+    if why == "no record":
+        path.with_suffix(".json").unlink()
+    cut_off = ("--prospect",) if why == "a branch was cut" else ()
+    ended = run("--device", "cpu", "--front", front("cpu"), *cut_off, "--json")
+    told = json.loads(ended.out)["expected"]
+    assert [told[name] for name in ("d1_all", "epe", "miou", "judged_on")] == [None] * 4
+    assert told["evidence"] == {"latency": "interpolated", "accuracy": None}
+    assert told["fps"] == 25
+    assert "accuracy they reach is not known" in (ended.folder / "README.md").read_text()
+
+
+def test_weights_of_others_keep_the_promise_of_the_search(
+    run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
+) -> None:
+    asked = ("--device", "cpu", "--front", front("cpu"), "--model", checkpoint())
+    told = run(*asked, "--json").json["expected"]
+    assert (told["d1_all"], told["evidence"]["accuracy"]) == (5.5, "published")
+    text = (run(*asked).folder / "README.md").read_text()
+    assert "those of the search's source, not of these weights" in text
+
+
 def test_a_checkpoint_that_does_not_hold_the_pick_is_refused_with_each_difference(
     run: Any, front: Callable[..., Path], checkpoint: Callable[..., Path]
 ) -> None:

@@ -1,0 +1,63 @@
+"""The machine at hand, and in what it differs from the one that a profile was made on."""
+
+from __future__ import annotations
+
+import platform
+from datetime import date
+from importlib.metadata import PackageNotFoundError, version
+from typing import Final
+
+from ..model.machine import processor
+from .profile import Machine
+
+PACKAGES: Final = ("rts2", "onnxruntime", "openvino", "torch")
+"""What a machine's versions name that is installed, or not; other names are no packages."""
+
+
+def this_machine(runtime: str, threads: int) -> Machine:
+    """What the machine at hand is, with versions and date."""
+    from .runtimes import versions
+
+    own = {"rts2": version("rts2"), "python": platform.python_version()}
+    return Machine(
+        processor=processor(),
+        threads=threads,
+        system=f"{platform.system()} {platform.machine()}",
+        versions=own | versions(runtime),
+        date=date.today().isoformat(),
+    )
+
+
+def differences(machine: Machine, threads: int) -> list[str]:
+    """What has changed on this machine since a profile was made here, or that it is another.
+
+    No runtime is imported for it.
+    """
+    told = []
+    here = processor()
+    if here != machine.processor:
+        told.append(f"the profile is of {machine.processor}; this is {here}")
+    if threads != machine.threads:
+        told.append(f"the profile is for {machine.threads} threads, not {threads}")
+    for name, then in sorted(machine.versions.items()):
+        now = _installed(name)
+        if now is not None and _public(now) != _public(then):
+            told.append(f"the profile was fitted with {name} {then}, not {now}")
+    return told
+
+
+def _installed(name: str) -> str | None:
+    """The version here, "none" for a package that is missing, None for what is no package."""
+    if name == "python":
+        return platform.python_version()
+    if name not in PACKAGES:
+        return None
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "none"
+
+
+def _public(number: str) -> str:
+    """A version without the label of its build, which a package tells and its metadata may not."""
+    return number.partition("+")[0]
