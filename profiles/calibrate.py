@@ -13,44 +13,66 @@ from scipy.optimize import least_squares, nnls
 
 from ..model.errors import Rts2Error
 from ..model.ops import ops
+from .heldout import hold_outs
+from .kit import fewshot
 from .latency import Floats, LatencyModel, Steps, latencies_ms
+from .parts import Harvest, PartModel, fit_parts, left_out
 from .profile import Calibration, Point, Profile
 
+Form = LatencyModel | PartModel
+"""What a fit fills: coefficients by step, or tables by part."""
 
-def fit(points: Sequence[Point], form: LatencyModel) -> LatencyModel:
-    """`form` with coefficients that fit `points`; its own values do not matter.
+
+def fit(points: Sequence[Point], form: Form) -> Form:
+    """`form` with values that fit `points`; its own do not matter.
 
     The sum form is linear and starts the search; the max form is refined from there.
 
     Raises:
         Rts2Error: fewer points than coefficients, or a coefficient that no point exercises.
     """
+    if isinstance(form, PartModel):
+        return fit_parts(_harvests(points))
     steps, truth = _table(points)
     return _fit(steps, truth, form)
 
 
 def recalibrated(profile: Profile) -> Profile:
-    """`profile` with every calibration fitted again to the profile's own points."""
-    fitted = tuple(
-        calibrated(profile.points_of(known.runtime, known.precision), known.model, known.source)
-        for known in profile.calibrations
-    )
+    """`profile` with every calibration fitted again to the profile's own points.
+
+    Tables of parts stay as they are; what rests on a prior starts from it again.
+    """
+    fitted = tuple(_again(profile, known) for known in profile.calibrations)
     return profile.model_copy(update={"calibrations": fitted})
 
 
-def calibrated(points: Sequence[Point], form: LatencyModel, source: str) -> Calibration:
-    """`form` fitted to the points of one runtime and precision, with the residuals of each."""
+def _again(profile: Profile, known: Calibration) -> Calibration:
+    points = profile.points_of(known.runtime, known.precision)
+    if known.prior is not None:
+        return fewshot.calibrated(points, known.prior, known.source)
+    if not isinstance(known.model, LatencyModel):
+        return known
+    return calibrated(points, known.model, known.source)
+
+
+def calibrated(points: Sequence[Point], form: Form, source: str) -> Calibration:
+    """`form` fitted to the points of one runtime and precision, with the errors of each left out,
+    of each family left out, and of each stage count.
+    """
     return Calibration(
         runtime=points[0].runtime,
         precision=points[0].precision,
         model=fit(points, form),
         residuals=tuple(float(residual) for residual in leave_one_out(points, form)),
         source=source,
+        held_out=hold_outs(points, lambda others: fit(others, form)),
     )
 
 
-def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
+def leave_one_out(points: Sequence[Point], form: Form) -> Floats:
     """ln(true / predicted) of each point, predicted by a fit on all the others."""
+    if isinstance(form, PartModel):
+        return left_out(_harvests(points))
     needed = len(form.ms_per) + 2
     if len(points) < needed:
         raise Rts2Error(
@@ -63,6 +85,15 @@ def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
         predicted = latencies_ms(fit(others, form), Steps.of([ops(point.arch, point.resolution)]))
         residuals.append(np.log(point.latency_ms / predicted[0]))
     return np.array(residuals)
+
+
+def _harvests(points: Sequence[Point]) -> list[Harvest]:
+    for point in points:
+        if point.parts_ms is None:
+            raise Rts2Error(
+                f"{point.arch.label()} was not timed part by part, which tables of parts need"
+            )
+    return [Harvest(point.arch, point.resolution, point.parts_ms or {}) for point in points]
 
 
 def _table(points: Sequence[Point]) -> tuple[Steps, Floats]:
@@ -117,7 +148,7 @@ def summary(residuals: Sequence[float]) -> dict[str, float]:
     }
 
 
-FORMS: dict[str, LatencyModel] = {
+FORMS: dict[str, Form] = {
     # Eager PyTorch behind a slow processor: each kernel's launch adds to its work.
     "eager": LatencyModel(
         combine="sum",
@@ -125,14 +156,18 @@ FORMS: dict[str, LatencyModel] = {
         start_ms=0,
         ms_per=dict.fromkeys(("gmac_2d", "gmac_2d_single", "gbyte", "mvoxel_warp"), 0.0),
     ),
-    # A GPU that waits for launches: a step takes its launch or its work, whichever is longer.
+    # A GPU that waits for launches: a step takes its launch or its work, whichever is longer. The
+    # many small kernels of a volume follow each other faster than steps do. 3D convs compute at
+    # the rate of 2D ones: no published point is slow enough in either to tell them apart.
     "launch_bound": LatencyModel(
         combine="max",
         starts="steps",
         folded=("norm", "relu"),
         start_ms=0,
-        ms_per=dict.fromkeys(("gmac_2d", "gmac_3d"), 0.0),
+        ms_per=dict.fromkeys(("gmac", "extra_kernel"), 0.0),
     ),
+    # A runtime that tells what each node takes.
+    "parts": PartModel(pixels=(1,), tables={}),
     # A fused graph on a CPU: norm and ReLU live inside the convs, channels come in blocks.
     "fused_cpu": LatencyModel(
         combine="sum",

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from ..model.arch import Arch
-from ..model.ops import Kind, Op, ops
+from ..model.errors import Rts2Error
+from ..model.ops import BYTES_PER_ELEMENT, Kind, Op, ops
+from .parts import PartModel, parts
 
 Floats = NDArray[np.float64]
 Milliseconds = Annotated[float, Field(ge=0, le=1e6)]
@@ -49,23 +51,57 @@ def _whole_blocks(channels: int) -> int:
     return -(-channels // CHANNEL_BLOCK) * CHANNEL_BLOCK
 
 
+def _packed(op: Op) -> float:
+    """Multiply-adds of a 2D convolution that packs channels in blocks: outputs always, inputs once
+    there is a whole block of them.
+    """
+    inputs, outputs = op.inputs[0][1], op.output[1]
+    filled = _whole_blocks(outputs) / outputs
+    if inputs >= CHANNEL_BLOCK:
+        filled *= _whole_blocks(inputs) / inputs
+    return _macs(op, "conv2d") * filled
+
+
+def _repacked(op: Op) -> float:
+    """10⁹ bytes of a 2D convolution's maps that fill no whole blocks, and are copied for it."""
+    if op.kind != "conv2d":
+        return 0.0
+    maps = [op.output, *(shape for shape in op.inputs if shape[1] > CHANNEL_BLOCK)]
+    return sum(BYTES_PER_ELEMENT * prod(m) / 1e9 for m in maps if m[1] % CHANNEL_BLOCK)
+
+
+def _columns(op: Op) -> float:
+    """10⁹ bytes of what a 3D convolution of 3×3×3 reads once its windows are laid out in a row."""
+    if op.kind != "conv3d":
+        return 0.0
+    return 27 * BYTES_PER_ELEMENT * op.inputs[0][1] * prod(op.output[2:]) / 1e9
+
+
 def _warped(op: Op) -> float:
     return prod(op.output) / 1e6 if op.kind == "warp_volume" else 0.0
 
 
 FEATURES: dict[str, Callable[[Op], float]] = {
+    "gmac": lambda op: op.macs / 1e9,
     "gmac_2d": lambda op: _macs(op, "conv2d"),
     "gmac_2d_single": _single,
     "gmac_2d_blocked": lambda op: _blocked(op, "conv2d"),
+    "gmac_2d_packed": _packed,
     "gmac_3d": lambda op: _macs(op, "conv3d"),
     "gmac_3d_blocked": lambda op: _blocked(op, "conv3d"),
     "gbyte": lambda op: op.bytes / 1e9,
     "gbyte_resize": lambda op: op.bytes / 1e9 if op.kind == "resize" else 0.0,
+    "gbyte_argmax": lambda op: op.bytes / 1e9 if op.kind == "argmax" else 0.0,
+    "gbyte_repacked": _repacked,
+    "gbyte_columns": _columns,
     "mvoxel_warp": _warped,
+    "extra_kernel": lambda op: float(op.launches - 1),
 }
-"""What work is measured in: 10⁹ multiply-adds of 2D convs, of those on one image alone (the
+"""What work is measured in: 10⁹ multiply-adds, of 2D convs, of those on one image alone (the
 semantic and refinement branches), with channels filled up to blocks (2D: inputs and outputs, 3D:
-outputs), of 3D convs; 10⁹ bytes moved, and of those by resizing; 10⁶ voxels of residual volumes."""
+outputs; `packed`: inputs only from a whole block on), of 3D convs; 10⁹ bytes moved, of those by
+resizing, by finding the best class, by copying maps into whole blocks, and by laying out the
+windows of 3D convs; 10⁶ voxels of residual volumes; kernels of a step beyond its first."""
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -105,6 +141,7 @@ class Steps:
     features: Floats
     """(n, len(FEATURES))"""
     firsts: NDArray[np.int64]
+    lists: tuple[Sequence[Op], ...]
 
     @classmethod
     def of(cls, lists: Iterable[Sequence[Op]]) -> Steps:
@@ -119,6 +156,7 @@ class Steps:
             np.array([op.macs for op in flat], dtype=np.float64),
             np.array([[feature(op) for feature in FEATURES.values()] for op in flat]),
             np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64),
+            tuple(known),
         )
 
     def summed(self, per_step: Floats) -> Floats:
@@ -137,11 +175,34 @@ def step_costs_ms(model: LatencyModel, steps: Steps) -> Floats:
     return np.where(np.isin(steps.kinds, folded), 0.0, cost)
 
 
-def latencies_ms(model: LatencyModel, steps: Steps) -> Floats:
+def latencies_ms(model: LatencyModel | PartModel, steps: Steps) -> Floats:
     """The latency of each op list, in milliseconds: (lists,)."""
+    if isinstance(model, PartModel):
+        return np.array([model.total_ms(parts(found)) for found in steps.lists])
     return steps.summed(step_costs_ms(model, steps))
 
 
-def predict_ms(model: LatencyModel, arch: Arch, resolution: tuple[int, int]) -> float:
-    """The latency of one arch at (width, height), in milliseconds."""
-    return float(latencies_ms(model, Steps.of([ops(arch, resolution)]))[0])
+def predict_ms(model: LatencyModel | PartModel, arch: Arch, resolution: tuple[int, int]) -> float:
+    """The latency of one arch at (width, height), in milliseconds.
+
+    Raises:
+        Rts2Error: the model gives a step of the arch no cost.
+    """
+    steps = Steps.of([ops(arch, resolution)])
+    if isinstance(model, LatencyModel):
+        require_costs(model, steps)
+    return float(latencies_ms(model, steps)[0])
+
+
+def require_costs(model: LatencyModel, steps: Steps) -> None:
+    """Raises `Rts2Error` with the name of the first step that would cost nothing.
+
+    Only steps of a folded kind may: what no coefficient knows is unknown, not free.
+    """
+    free = step_costs_ms(model, steps) <= 0
+    for op, costless in zip((op for found in steps.lists for op in found), free, strict=True):
+        if costless and op.kind not in model.folded:
+            raise Rts2Error(
+                f"the latency model has no cost for {op.name} ({op.kind}); "
+                "fit it to timings of networks with that step"
+            )

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from rts2.model.arch import Arch
+from rts2.model.errors import Rts2Error
 from rts2.model.ops import Kind, Op, ops
 from rts2.profiles.latency import (
     FEATURES,
@@ -16,6 +17,7 @@ from rts2.profiles.latency import (
     Steps,
     latencies_ms,
     predict_ms,
+    require_costs,
     step_costs_ms,
 )
 from rts2.profiles.profile import load, names
@@ -36,11 +38,14 @@ WARP = Op("warp", "warp_volume", ((1, 2, 300, 200),) * 2, (1, 5, 300, 200), laun
 TINY = (PAIR, SINGLE, SOLID, NORM, WARP)
 
 WORK = {
+    "gmac": (2.0, 0.5, 0.25, 0, 0),
     "gmac_2d": (2.0, 0.5, 0, 0, 0),
     "gmac_2d_single": (0, 0.5, 0, 0, 0),
     # 20 outputs fill two blocks of 16, so 32 are computed; 32 fill theirs. An image's three inputs
     # stay three, 8 inputs become 16; of a 3D conv outputs alone are filled, 2 become 16.
     "gmac_2d_blocked": (2.0 * 32 / 20, 0.5 * 16 / 8, 0, 0, 0),
+    # The same, but 8 inputs are less than a block and stay 8.
+    "gmac_2d_packed": (2.0 * 32 / 20, 0.5, 0, 0, 0),
     "gmac_3d": (0, 0, 0.25, 0, 0),
     "gmac_3d_blocked": (0, 0, 0.25 * 16 / 2, 0, 0),
     "gbyte": (
@@ -51,7 +56,12 @@ WORK = {
         4e-9 * (2 * 120_000 + 300_000),
     ),
     "gbyte_resize": (0, 0, 0, 0, 0),
+    "gbyte_argmax": (0, 0, 0, 0, 0),
+    # 20 outputs leave a block half empty; 27 numbers for each of 100 voxels.
+    "gbyte_repacked": (4e-9 * 4000, 0, 0, 0, 0),
+    "gbyte_columns": (0, 0, 4e-9 * 27 * 100, 0, 0),
     "mvoxel_warp": (0, 0, 0, 0, 0.3),
+    "extra_kernel": (2, 0, 0, 0, 28),
 }
 """What each step of `TINY` counts in each feature, by hand."""
 
@@ -168,6 +178,8 @@ def looped_ms(form: LatencyModel, op: Op) -> float:
     filled = gmac * 16 * -(-outputs // 16) / outputs
     deep = 1 if inputs <= 3 else 16 * -(-inputs // 16) / inputs
     counted = {
+        "gmac": gmac,
+        "extra_kernel": op.launches - 1,
         "gmac_2d": gmac if op.kind == "conv2d" else 0,
         "gmac_2d_single": gmac if op.kind == "conv2d" and op.inputs[0][0] == 1 else 0,
         "gmac_2d_blocked": filled * deep if op.kind == "conv2d" else 0,
@@ -191,8 +203,24 @@ def test_more_work_is_never_faster(device: str) -> None:
     assert predict_ms(form, Arch(), (2484, 750)) > predict_ms(form, Arch(), (1242, 375))
 
 
+def test_a_step_without_a_cost_is_named() -> None:
+    """Where nothing but convolutions has a coefficient, the first other step is unknown."""
+    form = model(start_ms=0.0, gmac=1.0)
+    with pytest.raises(Rts2Error, match=r"no cost for encoder\.pair \(concat\)"):
+        predict_ms(form, Arch(), (320, 96))
+    with pytest.raises(Rts2Error, match=r"no cost for features\.pair \(concat\)"):
+        predict_ms(form, Arch(family="anynet", c=1, semantic=False, refinement=False), (320, 96))
+
+
+def test_a_folded_step_may_cost_nothing() -> None:
+    steps = Steps.of([[PAIR, NORM]])
+    require_costs(model(folded=("norm",), gmac=1.0), steps)
+    with pytest.raises(Rts2Error, match=r"no cost for norm \(norm\)"):
+        require_costs(model(gmac=1.0), steps)
+
+
 def test_an_unknown_feature_is_refused_by_name() -> None:
-    with pytest.raises(ValidationError, match="gmac_4d is no feature; known are gmac_2d"):
+    with pytest.raises(ValidationError, match="gmac_4d is no feature; known are gmac, gmac_2d"):
         model(gmac_2d=1.0, gmac_4d=1.0)
 
 
