@@ -9,9 +9,11 @@ from math import exp, log
 from typing import Any
 
 from ..model.arch import Arch, Precision
-from .calibrate import leave_one_out, summary
+from ..model.errors import Rts2Error
+from .calibrate import recalibrated, summary
+from .conformal import half_width
 from .latency import predict_ms
-from .measure import Bench, random_candidate
+from .measure import Bench, Job, random_candidate
 from .profile import Profile, Resolution, Runtime
 
 CHECK_SEED = 1_000_003
@@ -30,6 +32,8 @@ class Comparison:
     fps_predicted: float
     drift: float = 1.0
     """How much slower the machine ran than when the profile was made; divided out of `fps_true`."""
+    reliable: bool = True
+    """Whether the runs agreed; no error is told of a timing that is not."""
 
     @property
     def residual(self) -> float:
@@ -40,9 +44,9 @@ class Comparison:
 def held_out(profile: Profile) -> list[Comparison]:
     """Every point of the profile, predicted from all the others of its runtime and precision."""
     found = []
-    for known in profile.calibrations:
+    for known in recalibrated(profile).calibrations:
         points = profile.points_of(known.runtime, known.precision)
-        residuals = leave_one_out(points, known.model)
+        residuals = known.residuals
         for point, residual in zip(points, residuals, strict=True):
             found.append(
                 Comparison(
@@ -57,35 +61,72 @@ def held_out(profile: Profile) -> list[Comparison]:
     return found
 
 
-def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[Comparison]:
-    """Random networks that no fit has seen, timed on this machine now.
+def groups_held_out(profile: Profile) -> list[dict[str, Any]]:
+    """The errors of whole families and stage counts left out, one entry per calibration.
 
-    A machine drifts from day to day; what the reference network in between takes now and took
-    then is divided out.
+    Fractions, and null where too few points remain to fit.
     """
-    known = profile.calibration("onnxruntime", "fp32")
+    return [
+        {
+            "runtime": known.runtime,
+            "precision": known.precision,
+            **known.held_out.model_dump(mode="json"),
+        }
+        for known in recalibrated(profile).calibrations
+        if known.held_out is not None
+    ]
+
+
+def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[Comparison]:
+    """Random networks that no fit has seen, timed on this machine now, in all of the profile's
+    precisions.
+
+    What counts is the ratio to the reference beside it: a machine drifts from day to day.
+    """
     chance = random.Random(CHECK_SEED + seed)
+    machine = profile.machine
+    precisions = [c.precision for c in profile.calibrations if c.runtime == bench.runtime]
     for _ in range(samples):
-        arch, resolution = random_candidate(chance)
-        timing = bench.time(arch, resolution)
-        then = profile.machine.reference_ms if profile.machine is not None else None
-        drift = 1.0 if then is None else timing.reference_ms / then
-        predicted = predict_ms(known.model, arch, resolution)
+        job = Job(*random_candidate(chance), chance.choice(precisions))
+        timing = bench.time(job)
+        then = (machine and machine.reference_ms) or timing.reference_ms
+        known = profile.calibration(bench.runtime, job.precision)
         yield Comparison(
-            arch,
-            "fp32",
-            "onnxruntime",
-            resolution,
-            drift * 1000 / timing.median_ms,
-            1000 / predicted,
-            drift,
+            job.arch,
+            job.precision,
+            bench.runtime,
+            job.resolution,
+            1000 / (timing.ratio * then),
+            1000 / predict_ms(known.model, job.arch, job.resolution),
+            timing.reference_ms / then,
+            timing.reliable,
         )
 
 
+def coverage(profile: Profile, comparisons: Sequence[Comparison], confidence: float) -> float:
+    """The share of reliable timings within the interval that the profile gives at a confidence."""
+    widths = {
+        (known.runtime, known.precision): half_width(known.residuals, confidence)
+        for known in profile.calibrations
+    }
+    inside = [abs(c.residual) <= widths[c.runtime, c.precision] for c in comparisons if c.reliable]
+    return sum(inside) / len(inside)
+
+
 def report(profile: Profile, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """The check as JSON: schema rts2.profile-check/1; errors are fractions."""
+    """The check as JSON: schema rts2.profile-check/1; errors are fractions, of reliable timings.
+
+    Raises `Rts2Error` where no timing was reliable.
+    """
     from scipy.stats import spearmanr
 
+    told = len(comparisons)
+    comparisons = [comparison for comparison in comparisons if comparison.reliable]
+    if not comparisons:
+        raise Rts2Error(
+            f"none of {told} timings was reliable: close what else runs on this machine, "
+            "and check again"
+        )
     true = [comparison.fps_true for comparison in comparisons]
     predicted = [comparison.fps_predicted for comparison in comparisons]
     ranked = len(set(true)) > 1 and len(set(predicted)) > 1
@@ -94,6 +135,7 @@ def report(profile: Profile, comparisons: Sequence[Comparison]) -> dict[str, Any
         "schema": "rts2.profile-check/1",
         "device": profile.name,
         "n": len(comparisons),
+        "unreliable": told - len(comparisons),
         **summary([comparison.residual for comparison in comparisons]),
         "spearman": rank,
         "points": [

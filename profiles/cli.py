@@ -4,30 +4,39 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from statistics import median
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from ..model.arch import Precision
+from ..model.box import SHIPPED, named_model
 from ..model.console import (
+    KITTI,
     add_output,
     command,
     parser,
     positive,
     print_json,
     progress,
+    resolution,
     screen,
     seed,
 )
-from ..model.errors import Rts2Error, UsageError
-from ..model.files import output_file, write_json
+from ..model.errors import UsageError
+from ..model.files import output_file, output_folder, write_json
 from .conformal import half_width
+from .kit import cli as kit_cli
+from .parts import PartModel
 from .profile import Profile, load, names
+from .runtimes import RUNTIMES
 
 if TYPE_CHECKING:
-    from .measure import Bench, Journal
+    from .check import Comparison
+    from .latency import LatencyModel
+    from .measure import Bench, Job
 
 CONFIDENCE = 0.9
 
@@ -36,7 +45,15 @@ CONFIDENCE = 0.9
 def profile(arguments: Sequence[str] | None = None) -> int:
     """Lists, shows, checks and fits device profiles."""
     options = _parser().parse_args(arguments)
-    run = {"list": _list, "show": _show, "check": _check, "fit": _fit, "measure": _measure}
+    run = {
+        "list": _list,
+        "show": _show,
+        "check": _check,
+        "fit": _fit,
+        "measure": _measure,
+        "kit": kit_cli.kit,
+        "import": kit_cli.import_results,
+    }
     run[options.action](options)
     return 0
 
@@ -64,6 +81,8 @@ def _parser() -> argparse.ArgumentParser:
     checked.add_argument("--samples", type=_count, metavar="N", help=text)
     _add_timing(checked)
     _add_seed(checked)
+    text = "folder for check.json and a picture of it, check.png (default: none is written)"
+    checked.add_argument("--out", type=Path, metavar="DIR", help=text)
     add_output(checked, out=None)
 
     fitted = actions.add_parser("fit", help="time networks on this machine and fit its profile")
@@ -71,14 +90,34 @@ def _parser() -> argparse.ArgumentParser:
     fitted.add_argument("--device", required=True, help=text)
     text = "seconds to spend on timing (default: 300)"
     fitted.add_argument("--budget", type=positive, default=300.0, metavar="SECONDS", help=text)
+    text = "what runs the networks: onnxruntime or openvino (default: onnxruntime)"
+    fitted.add_argument(
+        "--runtime", choices=("onnxruntime", "openvino"), default="onnxruntime", help=text
+    )
     fitted.add_argument("--out", type=Path, required=True, metavar="FILE", help="the new profile")
     _add_timing(fitted)
     _add_seed(fitted)
     add_output(fitted, out=None)
 
-    measured = actions.add_parser("measure", help="time ONNX files on this machine")
-    measured.add_argument("models", nargs="+", type=Path, metavar="MODEL", help="ONNX files")
+    kit_cli.add_actions(actions, known)
+
+    measured = actions.add_parser("measure", help="time models on this machine")
+    text = (
+        f"{', '.join(SHIPPED)} in the box, a checkpoint, an ONNX file, "
+        "or a bundle (the folder of rts2-deploy)"
+    )
+    measured.add_argument("models", nargs="+", type=named_model, metavar="MODEL", help=text)
+    text = f"what runs them: {', '.join(RUNTIMES)} (default: onnxruntime)"
+    measured.add_argument(
+        "--runtime", choices=RUNTIMES, default="onnxruntime", metavar="RUNTIME", help=text
+    )
+    text = "fp32, bf16, fp16 or int8, where the runtime has it (default: as the model is stored)"
+    measured.add_argument("--precision", choices=get_args(Precision), help=text)
     _add_timing(measured)
+    text = "of the images that a checkpoint is timed with (default: {}x{})".format(*KITTI)
+    measured.add_argument("--resolution", type=resolution, metavar="WxH", help=text)
+    text = "stop a checkpoint after this many stages (default: all)"
+    measured.add_argument("--stages", type=_count, metavar="K", help=text)
     add_output(measured, out=None)
     return described
 
@@ -146,19 +185,20 @@ def _show(options: argparse.Namespace) -> None:
 def _coefficients(known: Profile) -> Any:
     """Every latency model: fitted ones with their held-out error, scaled ones with their ratios."""
     from .calibrate import summary
+    from .heldout import errors_told
 
     table = _table("runtime", "precision", "latency model, in ms", "held-out error", "source")
     for fitted in known.calibrations:
-        per = [f"{ms:.3g} per {name}" for name, ms in fitted.model.ms_per.items()]
-        terms = [f"{fitted.model.start_ms:.3g} per start ({fitted.model.starts})", *per]
-        joint = " + " if fitted.model.combine == "sum" else " or, if longer, "
-        model = terms[0] + joint + " + ".join(terms[1:])
+        model = _model_told(fitted.model)
         error = summary(fitted.residuals)
         width = half_width(fitted.residuals, CONFIDENCE)
         told = (
             f"{error['mape']:.1%} mean, {error['max_ape']:.1%} worst; "
             f"{CONFIDENCE:.0%} interval ±{width:.1%}"
         )
+        if fitted.held_out is not None:
+            told += f"\na family left out: {errors_told(fitted.held_out.family)}"
+            told += f"\na stage count left out: {errors_told(fitted.held_out.stages)}"
         table.add_row(fitted.runtime, fitted.precision, model, told, fitted.source)
     for derived in known.derivations:
         ratios = [f"{name} × {factor:g}" for name, factor in derived.factors.items()]
@@ -168,20 +208,56 @@ def _coefficients(known: Profile) -> Any:
     return table
 
 
+def _model_told(model: LatencyModel | PartModel) -> str:
+    """Coefficients, or how many places the tables of parts have."""
+    if isinstance(model, PartModel):
+        places = sum(len(row) for table in model.tables.values() for row in table.ms)
+        sizes = ", ".join(f"{pixels / 1e6:.2f}" for pixels in model.pixels)
+        return f"{len(model.tables)} parts, {places} places in their tables, at {sizes} megapixels"
+    per = [f"{ms:.3g} per {name}" for name, ms in model.ms_per.items()]
+    terms = [f"{model.start_ms:.3g} per start ({model.starts})", *per]
+    joint = " + " if model.combine == "sum" else " or, if longer, "
+    return terms[0] + joint + " + ".join(terms[1:])
+
+
 def _check(options: argparse.Namespace) -> None:
-    from .check import fresh, held_out, report
+    from .check import groups_held_out, held_out, report
 
     known = load(options.device)
     if options.samples is None:
         comparisons = held_out(known)
+        result = report(known, comparisons) | {"held_out": groups_held_out(known)}
     else:
-        bench = _bench(options, known)
-        timed = fresh(known, bench, options.samples, options.seed)
-        comparisons = list(progress(timed, "timing", options.samples))
-    result = report(known, comparisons)
+        comparisons, result = _timed_now(options, known)
+    if options.out is not None:
+        _write_check(options.out, known, comparisons, result)
     if options.json:
         print_json(result)
         return
+    _print(_compared(comparisons))
+    _print(_summary(comparisons, result, fresh=options.samples is not None))
+    if options.out is not None:
+        _print(f"written   {options.out}/  check.json  check.png")
+    _print_groups(result.get("held_out", []))
+
+
+def _timed_now(
+    options: argparse.Namespace, known: Profile
+) -> tuple[list[Comparison], dict[str, Any]]:
+    """Networks that no fit has seen, timed on this machine."""
+    from .check import coverage, fresh, report
+
+    bench = _bench(options, known)
+    if options.out is not None:
+        output_folder(options.out)  # before minutes are spent on timing
+    timed = fresh(known, bench, options.samples, options.seed)
+    comparisons = list(progress(timed, "timing", options.samples))
+    reliable = [comparison for comparison in comparisons if comparison.reliable]
+    result = report(known, comparisons)
+    return comparisons, result | {"coverage": coverage(known, reliable, CONFIDENCE)}
+
+
+def _compared(comparisons: Sequence[Comparison]) -> Any:
     table = _table(
         "network", "resolution", "precision", "runtime", "FPS", "predicted", "latency error"
     )
@@ -195,37 +271,67 @@ def _check(options: argparse.Namespace) -> None:
             comparison.runtime,
             f"{comparison.fps_true:.2f}",
             f"{comparison.fps_predicted:.2f}",
-            f"{error:+.1%}",
+            f"{error:+.1%}" + ("" if comparison.reliable else " !"),
         )
-    _print(table)
+    return table
+
+
+def _summary(comparisons: Sequence[Comparison], result: dict[str, Any], fresh: bool) -> str:
     how = "left out in turn"
-    if options.samples is not None:
+    if fresh:
         drift = median(comparison.drift for comparison in comparisons)
         how = f"timed now, at {drift:.2f} × the latency of the profile's day, which is divided out"
     rank = "" if result["spearman"] is None else f", Spearman {result['spearman']:.3f}"
-    _print(
+    lines = [
         f"\n{result['n']} networks {how}: mean error {result['mape']:.1%}, "
         f"worst {result['max_ape']:.1%}, {result['within_5']:.0%} within 5%, "
         f"{result['within_10']:.0%} within 10%{rank}"
-    )
+    ]
+    if fresh:
+        lines.append(f"{result['coverage']:.0%} of them within the {CONFIDENCE:.0%} interval")
+    if result["unreliable"]:
+        lines.append(f"! {result['unreliable']} unreliable: their runs disagree; not counted")
+    return "\n".join(lines)
+
+
+def _print_groups(entries: list[dict[str, Any]]) -> None:
+    """A line for each grouping of each calibration's points."""
+    from .heldout import errors_told
+    from .profile import HoldOut
+
+    for entry in entries:
+        for group, name in (("family", "a family"), ("stages", "a stage count")):
+            errors = errors_told(HoldOut.model_validate(entry[group]))
+            _print(f"{entry['precision']} on {entry['runtime']}, {name} left out: {errors}")
+
+
+def _write_check(
+    out: Path, known: Profile, comparisons: Sequence[Comparison], result: dict[str, Any]
+) -> None:
+    """The check as JSON and as a picture."""
+    from .plot import save
+
+    folder = output_folder(out)
+    reliable = [comparison for comparison in comparisons if comparison.reliable]
+    width = half_width(known.calibrations[0].residuals, CONFIDENCE)
+    write_json(folder / "check.json", result)
+    save(reliable, known.title, width, folder / "check.png")
 
 
 def _bench(options: argparse.Namespace, known: Profile) -> Bench:
     """A bench on this machine, if the profile is one of a machine at hand."""
-    from ..model.machine import cores
-    from .measure import Bench, this_machine
+    from .here import differences
+    from .measure import Bench
 
     if known.machine is None:
         raise UsageError(
             f"{known.title} is not this machine; without --samples its points are left out in turn"
         )
+    runtime = known.calibrations[0].runtime
     threads = options.threads or known.machine.threads
-    here = this_machine(threads)
-    if here.processor != known.machine.processor:
-        _warn(f"the profile is of {known.machine.processor}; this is {here.processor}")
-    if here.versions != known.machine.versions:
-        _warn(f"the profile was fitted with {known.machine.versions}, not {here.versions}")
-    return Bench(min(threads, cores()))
+    for difference in differences(known.machine, threads):
+        _warn(difference)
+    return Bench(runtime, threads)
 
 
 def _warn(text: str) -> None:
@@ -259,29 +365,22 @@ def _fit(options: argparse.Namespace) -> None:
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:
     """Times networks until the budget is spent, going on where an earlier run stopped."""
     from ..model.machine import cores
-    from .calibrate import FORMS
-    from .measure import Bench, candidates, extend, open_journal, profile_of
+    from .measure import Bench, extend, jobs, open_journal, profile_of
 
+    deadline = monotonic() + options.budget
     threads = options.threads or cores()
     journal_path = path.with_name(f"{path.stem}.timings.json")
-    journal = open_journal(journal_path, threads, options.seed)
-    deadline = monotonic() + options.budget
-    bench = Bench(threads)
-    remaining = islice(candidates(options.seed), len(journal.samples), None)
-    for candidate in _until(deadline, remaining, journal):
-        journal = extend(journal, journal_path, bench, candidate)
-    needed = 2 * (1 + len(FORMS["fused_cpu"].ms_per))
-    if len(journal.samples) < needed:
-        raise Rts2Error(
-            f"{len(journal.samples)} networks were timed and a fit needs {needed}; "
-            "the same command with a longer --budget goes on from here"
-        )
+    journal = open_journal(journal_path, options.runtime, threads, options.seed)
+    bench = Bench(options.runtime, threads)
+    remaining = islice(jobs(options.seed, bench.precisions), len(journal.samples), None)
+    for job in _until(deadline, remaining, len(journal.samples)):
+        journal = extend(journal, journal_path, bench.harvest(job))
     name = re.sub("[^a-z0-9._-]+", "-", path.stem.lower()).strip("._-")
     return profile_of(journal, template, name or template.name)
 
 
-def _until(deadline: float, items: Any, journal: Journal) -> Any:
-    """Items until the deadline, with a bar of the seconds spent on a terminal."""
+def _until(deadline: float, items: Iterator[Job], timed: int) -> Iterator[Job]:
+    """Jobs until the deadline, with a bar of the seconds spent on a terminal."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -289,51 +388,63 @@ def _until(deadline: float, items: Any, journal: Journal) -> Any:
     started = monotonic()
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("timing networks", total=deadline - started)
-        for count, item in enumerate(items, len(journal.samples) + 1):
+        for count, item in enumerate(items, timed + 1):
             if monotonic() >= deadline:
                 return
-            text = f"timing network {count}: {item[0].label()}"
+            text = f"timing network {count}: {item.arch.label()}"
             bar.update(task, completed=monotonic() - started, description=text)
             yield item
 
 
 def _measure(options: argparse.Namespace) -> None:
-    from ..model.files import existing_file
     from ..model.machine import cores
-    from .measure import Bench, this_machine
+    from .timed import BOUNDARY, REFERENCE_TOLD, Clock, given
+    from .timing import MAX_SPREAD
 
     threads = options.threads or cores()
-    paths = [existing_file(path, "an ONNX file") for path in options.models]
-    bench = Bench(threads)
-    timed = [(path, bench.time_file(path)) for path in progress(paths, "timing", len(paths))]
+    models = [given(path, options.resolution, options.stages) for path in options.models]
+    clock = Clock(options.runtime, threads)
+    asked = [clock.precision(model, options.precision) for model in models]
+    pairs = list(zip(models, asked, strict=True))
+    rows = [clock.time(*pair) for pair in progress(pairs, "timing", len(pairs))]
     if options.json:
-        rows = [
+        print_json(
             {
-                "model": str(path),
-                "latency_ms": timing.median_ms,
-                "p95_ms": timing.p95_ms,
-                "fps": 1000 / timing.median_ms,
-                "runs": timing.runs,
-                "reference_ms": timing.reference_ms,
+                "schema": "rts2.profile-measure/1",
+                "machine": clock.machine.model_dump(mode="json", exclude_none=True),
+                "runtime": options.runtime,
+                "boundary": BOUNDARY,
+                "reference": REFERENCE_TOLD.format(clock.reference),
+                "models": [row.to_json() for row in rows],
             }
-            for path, timing in timed
-        ]
-        here = this_machine(threads).model_dump(mode="json")
-        print_json({"schema": "rts2.profile-measure/1", "machine": here, "models": rows})
+        )
         return
-    table = _table("model", "median", "95th percentile", "FPS", "runs", "against reference")
-    for path, timing in timed:
-        ratio = timing.median_ms / timing.reference_ms
+    table = _table(
+        "model", "size", "precision", "median ms", "p95 ms", "spread", "FPS", "runs", "× reference"
+    )
+    for row in rows:
+        timing = row.timing
         table.add_row(
-            str(path),
-            f"{timing.median_ms:.2f} ms",
-            f"{timing.p95_ms:.2f} ms",
+            row.name,
+            row.size or "–",
+            row.precision,
+            f"{timing.median_ms:.2f}",
+            f"{timing.p95_ms:.2f}",
+            f"{timing.spread:.1%}" + ("" if timing.reliable else " !"),
             f"{1000 / timing.median_ms:.1f}",
             str(timing.runs),
-            f"{ratio:.2f} ×",
+            f"{timing.ratio:.3f}",
         )
     _print(table)
-    _print(f"\nONNX Runtime, {threads} threads, batch 1, the network alone")
+    notes = [clock.told(), BOUNDARY, f"reference: {REFERENCE_TOLD.format(clock.reference)}"]
+    if not all(row.timing.reliable for row in rows):
+        notes.append(
+            f"! unreliable: a spread above {MAX_SPREAD:.0%} in every attempt; "
+            "close what else runs on this machine and measure again"
+        )
+    _print("")
+    for note in notes:
+        screen().print(note, soft_wrap=True)
 
 
 def _table(*columns: str) -> Any:

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from ..model.arch import Arch, Precision
 from ..model.errors import UsageError
 from ..model.files import parse_json, read_json
 from ..model.ops import Kind
 from .latency import FEATURES, LatencyModel
+from .parts import PartModel
 
 Runtime = Literal["pytorch", "onnxruntime", "openvino", "tensorrt"]
 Side = Annotated[int, Field(ge=32, le=16384)]
@@ -68,10 +77,44 @@ class Point(Frozen):
     fps: Annotated[float, Field(ge=1e-3, le=1e6)]
     evidence: Literal["published", "measured"]
     source: str
+    parts_ms: dict[str, Annotated[float, Field(ge=0)]] | None = None
+    """What of it each part of the network took, where it was timed node by node."""
 
     @property
     def latency_ms(self) -> float:
         return 1000 / self.fps
+
+
+def _form(model: Any) -> str:
+    """Which of the two kinds of latency model a value is."""
+    known = isinstance(model, PartModel) or (isinstance(model, dict) and "tables" in model)
+    return "parts" if known else "steps"
+
+
+class Misses(Frozen):
+    """Relative errors of the frame rates of `n` points that a fit has not seen, as fractions.
+
+    Without a mean where nothing could be fitted to the points that remained.
+    """
+
+    n: Annotated[int, Field(ge=0)]
+    mean: Annotated[float, Field(ge=0)] | None = None
+    worst: Annotated[float, Field(ge=0)] | None = None
+
+
+class HoldOut(Misses):
+    """Every group of points left out at once in turn: all their errors, and those of each group."""
+
+    groups: dict[str, Misses]
+
+
+class HeldOut(Frozen):
+    """What a fit is worth on networks unlike any that it has seen."""
+
+    family: HoldOut
+    """By variant: disparity, disparity+semantic, full; anynet."""
+    stages: HoldOut
+    """By the number of stages."""
 
 
 class Calibration(Frozen):
@@ -79,17 +122,31 @@ class Calibration(Frozen):
 
     runtime: Runtime
     precision: Precision
-    model: LatencyModel
+    model: Annotated[
+        Annotated[LatencyModel, Tag("steps")] | Annotated[PartModel, Tag("parts")],
+        Discriminator(_form),
+    ]
     residuals: tuple[Annotated[float, Field(ge=-7, le=7)], ...]
     """Leave-one-out ln(true / predicted), in the order of the points."""
     source: str
+    prior: LatencyModel | None = None
+    """What was known before, where the points were too few to fit by themselves."""
+    held_out: HeldOut | None = None
+    """The errors of whole groups left out; profiles of before have none."""
 
     @field_validator("model")
     @classmethod
-    def _something(cls, value: LatencyModel) -> LatencyModel:
-        if not any([value.start_ms, *value.ms_per.values()]):
+    def _something(cls, value: LatencyModel | PartModel) -> LatencyModel | PartModel:
+        if isinstance(value, LatencyModel) and not any([value.start_ms, *value.ms_per.values()]):
             raise ValueError("one coefficient at least must be above 0")
         return value
+
+    @property
+    def by_steps(self) -> LatencyModel:
+        """The model, where it is one of steps; `UsageError` where it is one of parts."""
+        if isinstance(self.model, PartModel):
+            raise UsageError(f"{self.precision} on {self.runtime} is known by parts, not by steps")
+        return self.model
 
 
 class Derivation(Frozen):
@@ -172,7 +229,11 @@ class Profile(Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Profile:
-        calibrated = {(known.runtime, known.precision) for known in self.calibrations}
+        calibrated = {
+            (known.runtime, known.precision)
+            for known in self.calibrations
+            if isinstance(known.model, LatencyModel)
+        }
         for known in self.calibrations:
             points = len(self.points_of(known.runtime, known.precision))
             if len(known.residuals) != points:
@@ -183,7 +244,7 @@ class Profile(Frozen):
         for derived in self.derivations:
             if derived.base not in calibrated:
                 raise ValueError(
-                    f"{derived.runtime} {derived.precision} derives from no calibration"
+                    f"{derived.runtime} {derived.precision} derives from no calibration of steps"
                 )
         return self
 

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import exp
+from math import exp, log1p
 from typing import TypedDict
 
 import numpy as np
@@ -24,6 +24,7 @@ from ..model.ops import Size, padded
 from ..profiles.conformal import half_width
 from ..profiles.evidence import Evidence, boxes
 from ..profiles.latency import Floats, LatencyModel, latencies_ms
+from ..profiles.parts import PartModel
 from ..profiles.profile import Calibration, Profile, Resolution, Runtime
 from ..profiles.profile import Point as Timing
 from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric
@@ -33,7 +34,7 @@ from .space import Parts, Space
 
 Flags = NDArray[np.bool_]
 
-BYTES_PER_WEIGHT: dict[Precision, int] = {"fp32": 4, "fp16": 2, "int8": 1}
+BYTES_PER_WEIGHT: dict[Precision, int] = {"fp32": 4, "bf16": 2, "fp16": 2, "int8": 1}
 
 KEEPS_ACCURACY: tuple[Precision, ...] = ("fp32", "fp16")
 """Half precision rounds to 11 bits, far below the tables' last digit; integers do not."""
@@ -66,7 +67,7 @@ class Executor:
 
     runtime: Runtime
     precision: Precision
-    model: LatencyModel
+    model: LatencyModel | PartModel
     base: Calibration
     """What was calibrated: this very executor, or the one that it derives from."""
 
@@ -171,7 +172,7 @@ def _executors(question: Question) -> list[Executor]:
     every = [Executor(c.runtime, c.precision, c.model, c) for c in profile.calibrations]
     for derivation in profile.derivations:
         base = profile.calibration(*derivation.base)
-        model = derivation.scale(base.model)
+        model = derivation.scale(base.by_steps)
         every.append(Executor(derivation.runtime, derivation.precision, model, base))
     chosen = [
         executor
@@ -192,11 +193,18 @@ class _Totals:
     def __init__(self, space: Space) -> None:
         self.space = space
         self._parts: dict[Size, Parts] = {}
+        self._latencies: dict[tuple[int, Size], Floats] = {}
+        """Of each part, by model and size."""
 
-    def latency_ms(self, model: LatencyModel, resolution: Resolution, stages: int) -> Floats:
+    def latency_ms(
+        self, model: LatencyModel | PartModel, resolution: Resolution, stages: int
+    ) -> Floats:
         """The predicted latency of every arch of a block."""
         parts = self._at(resolution)
-        return parts.totals(stages, latencies_ms(model, parts.steps))
+        key = (id(model), padded(resolution, Arch().multiple))
+        if key not in self._latencies:
+            self._latencies[key] = latencies_ms(model, parts.steps)
+        return parts.totals(stages, self._latencies[key])
 
     def weights(self, resolution: Resolution, stages: int) -> Floats:
         """The trained numbers of every arch of a block."""
@@ -324,13 +332,21 @@ class _Block:
         Where the model extrapolates, each step away from what was calibrated (to this executor,
         to this resolution, to this arch) changes the latency by a factor, and half of its
         logarithm is in doubt on top: a promised speed-up of two could be 1.4 or 2.8. What nobody
-        timed is at least twice as unsure as what somebody did.
+        timed is at least twice as unsure as what somebody did, and as unsure as what the model
+        said of a family that it was not fitted to.
         """
         sure = half_width(self.executor.base.residuals, self.question.confidence)
         if not extrapolated.any():
             return np.full(len(at), sure)
         steps = np.abs(np.diff(np.log(self._way_from_calibrated(at)), axis=0))
-        return np.where(extrapolated, sure + np.maximum(0.5 * steps.sum(0), sure), sure)
+        doubt = np.maximum(0.5 * steps.sum(0), max(sure, self._worst_held_out() - sure))
+        return np.where(extrapolated, sure + doubt, sure)
+
+    def _worst_held_out(self) -> float:
+        """How far the model missed, in natural logarithm, where a whole family was left out."""
+        held_out = self.executor.base.held_out
+        worst = held_out and held_out.family.worst
+        return -log1p(-min(worst, 0.9)) if worst else 0.0
 
     def _way_from_calibrated(self, at: NDArray[np.int64]) -> Floats:
         """Latencies of the archs at `at`, one step after the other, (4, n).

@@ -3,46 +3,28 @@
 import warnings
 from itertools import islice
 from math import exp, log
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rts2.model.arch import Arch
+from rts2.model.errors import Rts2Error
 from rts2.profiles.calibrate import fit, leave_one_out
-from rts2.profiles.check import Comparison, fresh, held_out, report
+from rts2.profiles.check import Comparison, coverage, fresh, held_out, report
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.measure import Bench, candidates
-from rts2.profiles.profile import Resolution, load
-from rts2.profiles.timing import Timing
+from rts2.profiles.measure import Job, jobs
+from rts2.profiles.profile import Profile, load
 from rts2.search.space import Space
 
 KEYS = [
-    *("schema", "device", "n", "mape", "max_ape", "within_5", "within_10", "spearman", "points"),
+    *("schema", "device", "n", "unreliable"),
+    *("mape", "max_ape", "within_5", "within_10", "spearman", "points"),
 ]
 
 
-def compared(true: float, predicted: float) -> Comparison:
-    return Comparison(Arch(c=1), "fp32", "pytorch", (1242, 375), true, predicted)
-
-
-class Off(Bench):
-    """A machine that is always `factor` times as slow as the cpu profile says.
-
-    On a day when everything, the reference too, takes `drift` times as long.
-    """
-
-    def __init__(self, factor: float, drift: float = 1.0) -> None:
-        self.factor, self.drift = factor, drift
-        self.timed: list[tuple[Arch, Resolution]] = []
-
-    def time(self, arch: Arch, resolution: Resolution) -> Timing:
-        self.timed.append((arch, resolution))
-        model = load("cpu").calibration("onnxruntime", "fp32").model
-        latency_ms = self.drift * self.factor * predict_ms(model, arch, resolution)
-        machine = load("cpu").machine
-        assert machine is not None
-        assert machine.reference_ms is not None
-        return Timing(latency_ms, latency_ms, 10, self.drift * machine.reference_ms)
+def compared(true: float, predicted: float, reliable: bool = True) -> Comparison:
+    return Comparison(Arch(c=1), "fp32", "pytorch", (1242, 375), true, predicted, reliable=reliable)
 
 
 def test_a_residual_is_of_latency() -> None:
@@ -119,32 +101,117 @@ def test_a_rank_that_does_not_exist_is_unknown(pairs: list[tuple[float, float]])
         assert report(load("tx2"), [compared(*pair) for pair in pairs])["spearman"] is None
 
 
-def test_fresh_networks_are_judged_by_the_profile_that_claims_them() -> None:
-    profile = load("cpu")
-    found = list(fresh(profile, Off(exp(0.07)), 5, seed=0))
+def test_an_unreliable_timing_is_told_and_not_counted() -> None:
+    """Two that are 0 and +10% off, and a third, twice off, whose runs disagree."""
+    pairs = [compared(10, 10), compared(30, 60, reliable=False), compared(20, 22)]
+    found = report(load("tx2"), pairs)
+    assert (found["n"], found["unreliable"]) == (2, 1)
+    assert found["mape"] == pytest.approx(0.05)
+    assert found["max_ape"] == pytest.approx(0.1)
+    assert [point["fps_true"] for point in found["points"]] == [10, 20]
+
+
+def test_no_reliable_timing_is_one_line_with_a_remedy() -> None:
+    pairs = [compared(10, 10, reliable=False)] * 3
+    with pytest.raises(Rts2Error, match=r"^none of 3 timings was reliable: close") as error:
+        report(load("tx2"), pairs)
+    assert "\n" not in str(error.value)
+
+
+def with_residuals(profile: Profile, *residuals: float) -> Profile:
+    (known,) = profile.calibrations
+    told = known.model_copy(update={"residuals": residuals})
+    return profile.model_copy(update={"calibrations": (told,)})
+
+
+def test_the_coverage_by_hand() -> None:
+    """Of nine residuals of 1% to 9% the 80% interval is the 8th, ±8%: it holds 0 and ±7%, and
+    neither ±8.5% nor what is unreliable."""
+    profile = with_residuals(load("tx2"), *(k / 100 for k in (-1, 2, -3, 4, -5, 6, -7, 8, -9)))
+    misses = (0.0, 0.07, -0.07, 0.085, -0.085)
+    pairs = [compared(10, 10 * exp(miss)) for miss in misses]
+    assert coverage(profile, pairs, 0.8) == pytest.approx(3 / 5)
+    assert coverage(profile, pairs, 0.9) == 1
+    unsure = [*pairs, compared(10, 20, reliable=False)]
+    assert coverage(profile, unsure, 0.8) == pytest.approx(3 / 5)
+
+
+def test_each_precision_is_covered_by_its_own_interval(exact: Profile) -> None:
+    (known,) = exact.calibrations
+    half = known.model_copy(
+        update={"precision": "bf16", "residuals": tuple(10 * r for r in known.residuals)}
+    )
+    both = exact.model_copy(update={"calibrations": (known, half)})
+    arch, size = Arch(c=1), (1242, 375)
+    pairs = [
+        Comparison(arch, precision, "onnxruntime", size, 10, 10 * exp(0.5))
+        for precision in ("fp32", "bf16")
+    ]
+    assert [coverage(both, [pair], 0.9) for pair in pairs] == [0, 1]
+
+
+def checked(profile: Profile, bench: Any, samples: int = 5, seed: int = 0) -> list[Comparison]:
+    return list(fresh(profile, bench, samples, seed))
+
+
+def test_fresh_networks_are_judged_by_the_profile_that_claims_them(
+    exact: Profile, planted: Any
+) -> None:
+    bench = planted()
+    bench.factor = exp(0.07)
+    found = checked(exact, bench)
     assert [c.residual for c in found] == pytest.approx([0.07] * 5)
-    told = report(profile, found)
+    assert [Job(c.arch, c.resolution, c.precision) for c in found] == bench.timed
+    told = report(exact, found)
     assert (told["n"], told["within_5"], told["within_10"]) == (5, 0.0, 1.0)
+    assert (coverage(exact, found, 0.5), coverage(exact, found, 0.9)) == (0, 1)
 
 
-def test_what_the_reference_drifted_is_divided_out_and_told() -> None:
-    found = list(fresh(load("cpu"), Off(exp(0.07), drift=1.5), 5, seed=0))
+def test_what_the_reference_drifted_is_divided_out_and_told(exact: Profile, planted: Any) -> None:
+    bench = planted()
+    bench.factor, bench.drift = exp(0.07), 1.5
+    found = checked(exact, bench)
     assert [c.residual for c in found] == pytest.approx([0.07] * 5)
     assert [c.drift for c in found] == pytest.approx([1.5] * 5)
 
 
-def test_fresh_networks_are_none_that_a_fit_was_made_of() -> None:
-    bench = Off(1)
-    list(fresh(load("cpu"), bench, 40, seed=0))
-    assert all(Space().position(arch) is not None for arch, _ in bench.timed)
+def test_runs_that_disagree_are_marked(exact: Profile, planted: Any) -> None:
+    bench = planted()
+    bench.spread = 0.09
+    assert all(c.reliable for c in checked(exact, bench))
+    bench.spread = 0.11
+    assert not any(c.reliable for c in checked(exact, bench))
+
+
+def test_fresh_networks_come_in_every_precision_of_the_runtime(
+    exact: Profile, planted: Any
+) -> None:
+    """Not in those that another runtime of the profile has."""
+    (known,) = exact.calibrations
+    more = [
+        known.model_copy(update={"precision": "bf16"}),
+        known.model_copy(update={"precision": "fp16", "runtime": "tensorrt"}),
+    ]
+    both = exact.model_copy(update={"calibrations": (known, *more)})
+    found = checked(both, planted(), 40)
+    assert {c.precision for c in found} == {"fp32", "bf16"}
+    for comparison in found:  # bf16 takes 0.6 of what is predicted
+        wanted = 0.0 if comparison.precision == "fp32" else log(0.6)
+        assert comparison.residual == pytest.approx(wanted)
+
+
+def test_fresh_networks_are_none_that_a_fit_was_made_of(exact: Profile, planted: Any) -> None:
+    bench = planted()
+    checked(exact, bench, 40)
+    assert all(Space().position(job.arch) is not None for job in bench.timed)
     for seed in (0, 1):
-        assert not set(bench.timed) & set(islice(candidates(seed), 24, 400))
+        assert not set(bench.timed) & set(islice(jobs(seed, ("fp32",)), 12, 400))
 
 
-def test_fresh_networks_depend_on_the_seed_alone() -> None:
-    benches = [Off(1), Off(1), Off(1)]
+def test_fresh_networks_depend_on_the_seed_alone(exact: Profile, planted: Any) -> None:
+    benches = [planted() for _ in range(3)]
     for bench, seed in zip(benches, (0, 0, 1), strict=True):
-        list(fresh(load("cpu"), bench, 10, seed))
+        checked(exact, bench, 10, seed)
     same, again, other = (bench.timed for bench in benches)
     assert same == again
     assert not set(same) & set(other)

@@ -2,96 +2,70 @@
 
 import json
 import random
-from collections.abc import Iterator
-from datetime import date
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rts2.model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, UNTRAINED, Arch
-from rts2.model.checkpoint import build
+from rts2.model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, Arch, Precision
 from rts2.model.errors import Rts2Error
-from rts2.model.export import export
+from rts2.model.ops import ops
+from rts2.profiles import measure, timing
+from rts2.profiles.here import this_machine
 from rts2.profiles.latency import predict_ms
 from rts2.profiles.measure import (
+    NEEDED,
     RESOLUTIONS,
     Bench,
-    Candidate,
+    Job,
     Journal,
-    Sample,
-    candidates,
-    corners,
     extend,
+    jobs,
     open_journal,
     profile_of,
     random_candidate,
-    this_machine,
 )
-from rts2.profiles.profile import Profile, Resolution, load
-from rts2.profiles.timing import Timing
+from rts2.profiles.parts import PartModel, parts
+from rts2.profiles.profile import Profile, load
 from rts2.search.space import Space
 
-TRUTH = load("cpu").calibration("onnxruntime", "fp32").model
-REFERENCE_MS = 10.0
+FIRST = 76
+"""Networks at the start of every plan: 12 heads, and each c at both sizes."""
+
+SMALL = Arch(c=1, stages=1, d_max=6, conv3d=(4,), semantic=False)
 
 
-class Planted(Bench):
-    """A machine that takes exactly what a latency model says, times the drift of the moment."""
-
-    def __init__(self) -> None:
-        self.drift = 1.0
-
-    def time(self, arch: Arch, resolution: Resolution) -> Timing:
-        latency_ms = predict_ms(TRUTH, arch, resolution) * self.drift
-        return Timing(latency_ms, 1.1 * latency_ms, 10, REFERENCE_MS * self.drift)
+def planned(count: int, seed: int = 0, precisions: tuple[Precision, ...] = ("fp32",)) -> list[Job]:
+    return list(islice(jobs(seed, precisions), count))
 
 
-def journal_of(timed: Iterator[Candidate], drifts: list[float]) -> Journal:
-    """A journal in which sample k was timed while the machine was `drifts[k]` times slower."""
-    samples = [
-        Sample(
-            arch=arch,
-            resolution=resolution,
-            latency_ms=predict_ms(TRUTH, arch, resolution) * drift,
-            reference_ms=REFERENCE_MS * drift,
-        )
-        for (arch, resolution), drift in zip(timed, drifts, strict=False)
-    ]
-    return Journal(machine=this_machine(2), seed=0, samples=tuple(samples))
+def opened(path: Path, seed: int = 0) -> Journal:
+    return open_journal(path, "onnxruntime", 2, seed)
 
 
-def numbers(candidate: Candidate) -> tuple[float, ...]:
-    arch, (width, height) = candidate
-    branches = arch.semantic + arch.refinement
-    return (arch.stages, arch.c, arch.d_max, branches, width, height)
+def numbers(job: Job) -> tuple[float, ...]:
+    arch, (width, height) = job.arch, job.resolution
+    return (arch.stages, arch.c, arch.semantic + arch.refinement, width, height)
 
 
-def test_corners_hold_both_ends_of_every_dimension() -> None:
-    found = corners()
-    assert len(found) == len(set(found)) == len(RESOLUTIONS) * 3 * 2 * 2
-    low = (1, SPACE_C[0], SPACE_D_MAX[0], 0, 640, 192)
-    high = (3, SPACE_C[-1], SPACE_D_MAX[-1], 2, 1242, 375)
-    table = np.array([numbers(candidate) for candidate in found])
-    assert tuple(table.min(0)) == low
-    assert tuple(table.max(0)) == high
-    assert set(table[:, 0]) == {1, 2, 3}
-    for column in (1, 2, 3, 4, 5):
-        assert set(table[:, column]) == {low[column], high[column]}
+def test_the_first_networks_hold_both_ends_of_every_dimension() -> None:
+    """Sixteen are enough: every head, and the whole network at both ends of c."""
+    for seed in range(5):
+        table = np.array([numbers(job) for job in planned(16, seed)])
+        assert tuple(table.min(0)) == (1, SPACE_C[0], 0, 640, 192)
+        assert tuple(table.max(0)) == (3, SPACE_C[-1], 2, 1242, 375)
+        assert set(table[:, 0]) == {1, 2, 3}
 
 
-def test_corners_are_in_the_space_and_have_all_widths_at_one_end() -> None:
-    for arch, _ in corners():
-        assert Space().position(arch) is not None
-        ends = [
-            (width == values[0], width == values[-1])
-            for width, values in zip(arch.conv3d, SPACE_CONV3D, strict=False)
-        ]
-        assert len(set(ends)) == 1
-        assert any(ends[0])
+def test_every_network_of_the_plan_lies_in_the_searched_space() -> None:
+    for job in planned(200):
+        assert Space().position(job.arch) is not None
+        assert job.resolution in RESOLUTIONS
 
 
 @given(st.integers(0, 2**32))
@@ -101,47 +75,84 @@ def test_a_random_candidate_lies_in_the_searched_space(seed: int) -> None:
     assert resolution in RESOLUTIONS
 
 
-def test_random_candidates_reach_every_value_of_every_dimension() -> None:
+def reached(drawn: Iterable[tuple[Arch, tuple[int, int]]]) -> dict[str, set[Any]]:
+    known = list(drawn)
+    return {
+        "c": {arch.c for arch, _ in known},
+        "d_max": {arch.d_max for arch, _ in known},
+        "branches": {arch.branches for arch, _ in known},
+        "resolution": {resolution for _, resolution in known},
+        **{
+            f"width.{stage}": {arch.conv3d[stage] for arch, _ in known if arch.stages > stage}
+            for stage in range(3)
+        },
+    }
+
+
+@pytest.mark.parametrize("stream", ["candidates", "plan"])
+def test_every_value_of_every_dimension_is_reached(stream: str) -> None:
     """By chance alone one of 2000 draws misses one of 32 values once in 10²⁶ runs."""
     chance = random.Random(0)
-    drawn = [random_candidate(chance) for _ in range(2000)]
-    assert {arch.c for arch, _ in drawn} == set(SPACE_C)
-    assert {arch.d_max for arch, _ in drawn} == set(SPACE_D_MAX)
-    assert {arch.branches for arch, _ in drawn} == {"disparity", "disparity+semantic", "full"}
-    assert {resolution for _, resolution in drawn} == set(RESOLUTIONS)
-    for stage, values in enumerate(SPACE_CONV3D):
-        widths = {arch.conv3d[stage] for arch, _ in drawn if arch.stages > stage}
-        assert widths == set(values)
+    drawn = {
+        "candidates": [random_candidate(chance) for _ in range(2000)],
+        "plan": [(job.arch, job.resolution) for job in planned(2000)],
+    }
+    assert reached(drawn[stream]) == {
+        "c": set(SPACE_C),
+        "d_max": set(SPACE_D_MAX),
+        "branches": {"disparity", "disparity+semantic", "full"},
+        "resolution": set(RESOLUTIONS),
+        **{f"width.{stage}": set(values) for stage, values in enumerate(SPACE_CONV3D)},
+    }
 
 
-def test_candidates_are_the_corners_first_and_the_same_for_the_same_seed() -> None:
-    first = list(islice(candidates(0), 80))
-    assert set(first[: len(corners())]) == set(corners())
-    assert first == list(islice(candidates(0), 80))
+def test_after_the_first_networks_every_c_comes_once_a_round() -> None:
+    count = len(SPACE_C)
+    rest = planned(FIRST + 3 * count)[FIRST:]
+    for start in range(0, 3 * count, count):
+        assert sorted(job.arch.c for job in rest[start : start + count]) == list(SPACE_C)
 
 
-def test_another_seed_draws_another_stream() -> None:
-    count = len(corners())
-    streams = [tuple(islice(candidates(seed), count + 50)) for seed in range(6)]
-    assert len({stream[:count] for stream in streams}) == 6
-    assert len({stream[count:] for stream in streams}) == 6
+def test_the_same_seed_plans_the_same_networks_and_another_others() -> None:
+    assert planned(120) == planned(120)
+    streams = [tuple(planned(FIRST + 50, seed)) for seed in range(6)]
+    assert len({stream[:FIRST] for stream in streams}) == 6
+    assert len({stream[FIRST:] for stream in streams}) == 6
 
 
-def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(tmp_path: Path) -> None:
+def test_every_network_is_timed_in_each_precision_in_turn() -> None:
+    both = planned(60, precisions=("fp32", "bf16"))
+    assert [job.precision for job in both] == ["fp32", "bf16"] * 30
+    alone = [(job.arch, job.resolution) for job in planned(30)]
+    for precision in (0, 1):
+        assert [(job.arch, job.resolution) for job in both[precision::2]] == alone
+
+
+def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(
+    tmp_path: Path, planted: Any
+) -> None:
     path = tmp_path / "x.timings.json"
-    journal = open_journal(path, 2, 0)
+    journal = opened(path)
     assert journal.samples == ()
     assert not path.exists()
-    bench = Planted()
-    for count, candidate in enumerate(islice(candidates(0), 3), 1):
-        journal = extend(journal, path, bench, candidate)
-        assert open_journal(path, 2, 0) == journal
+    bench = planted()
+    for count, job in enumerate(planned(3), 1):
+        journal = extend(journal, path, bench.harvest(job))
+        assert opened(path) == journal
         assert len(journal.samples) == count
         last = journal.samples[-1]
-        assert (last.arch, last.resolution) == candidate
-        assert last.latency_ms == pytest.approx(predict_ms(TRUTH, *candidate))
-        assert last.reference_ms == REFERENCE_MS
-    assert json.loads(path.read_text())["schema"] == "rts2.timings/1"
+        assert Job(last.arch, last.resolution, last.precision) == job
+        assert last.latency_ms == pytest.approx(bench.latency_ms(job))
+        assert sum(last.parts_ms.values()) == pytest.approx(last.latency_ms)
+    assert json.loads(path.read_text())["schema"] == "rts2.timings/2"
+
+
+@pytest.fixture
+def stored(tmp_path: Path, planted: Any) -> Path:
+    """A journal of one sample, of this machine, seed 0."""
+    path = tmp_path / "x.timings.json"
+    extend(opened(path), path, planted().harvest(planned(1)[0]))
+    return path
 
 
 @pytest.mark.parametrize(
@@ -152,130 +163,201 @@ def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(tmp_path: Path)
         {"system": "Plan 9"},
         {"versions": {"onnxruntime": "0.1"}},
         {"seed": 1},
+        {"runtime": "openvino"},
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_a_journal_of_another_machine_or_seed_is_refused_and_kept(
-    tmp_path: Path, change: dict[str, object]
+def test_a_journal_of_another_machine_runtime_or_seed_is_refused_and_kept(
+    stored: Path, change: dict[str, object]
 ) -> None:
-    path = tmp_path / "x.timings.json"
-    extend(open_journal(path, 2, 0), path, Planted(), corners()[0])
-    stored = json.loads(path.read_text())
-    (stored if "seed" in change else stored["machine"]).update(change)
-    path.write_text(json.dumps(stored))
-    with pytest.raises(Rts2Error, match="another machine, version or seed; delete it") as error:
-        open_journal(path, 2, 0)
-    assert str(path) in str(error.value)
-    assert json.loads(path.read_text()) == stored
+    held = json.loads(stored.read_text())
+    (held if change.keys() & held.keys() else held["machine"]).update(change)
+    stored.write_text(json.dumps(held))
+    said = "another machine, version, runtime or seed; delete it"
+    with pytest.raises(Rts2Error, match=said) as error:
+        opened(stored)
+    assert str(stored) in str(error.value)
+    assert json.loads(stored.read_text()) == held
 
 
-def test_a_journal_of_another_day_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "x.timings.json"
-    extend(open_journal(path, 2, 0), path, Planted(), corners()[0])
-    stored = json.loads(path.read_text())
-    stored["machine"]["date"] = "2001-01-01"
-    path.write_text(json.dumps(stored))
-    assert len(open_journal(path, 2, 0).samples) == 1
+def test_a_journal_of_another_day_goes_on(stored: Path) -> None:
+    held = json.loads(stored.read_text())
+    held["machine"]["date"] = "2001-01-01"
+    stored.write_text(json.dumps(held))
+    assert len(opened(stored).samples) == 1
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("latency_ms", 0), ("latency_ms", -1), ("arch", {"c": 0})]
+    ("field", "value"),
+    [
+        ("latency_ms", 0),
+        ("latency_ms", -1),
+        ("ratio", 0),
+        ("arch", {"c": 0}),
+        ("parts_ms", {"encoder": -1}),
+        ("precision", "fp8"),
+    ],
 )
-def test_a_broken_journal_is_named_in_one_line(tmp_path: Path, field: str, value: object) -> None:
-    path = tmp_path / "x.timings.json"
-    extend(open_journal(path, 2, 0), path, Planted(), corners()[0])
-    stored = json.loads(path.read_text())
-    stored["samples"][0][field] = value
-    path.write_text(json.dumps(stored))
+def test_a_broken_journal_is_named_in_one_line(stored: Path, field: str, value: object) -> None:
+    held = json.loads(stored.read_text())
+    held["samples"][0][field] = value
+    stored.write_text(json.dumps(held))
     with pytest.raises(Rts2Error, match=rf"a journal of timings .*samples\.0\.{field}") as error:
-        open_journal(path, 2, 0)
+        opened(stored)
     assert "\n" not in str(error.value)
+
+
+def test_a_journal_of_before_is_refused_by_its_schema(stored: Path) -> None:
+    stored.write_text(json.dumps(json.loads(stored.read_text()) | {"schema": "rts2.timings/1"}))
+    with pytest.raises(Rts2Error, match=r"a journal of timings .*schema"):
+        opened(stored)
 
 
 def fps(profile: Profile) -> list[float]:
     return [point.fps for point in profile.points]
 
 
-def test_a_drift_of_the_machine_cancels() -> None:
-    """Twice as slow in 7 of 16 samples: the reference's median, and so each point, stays."""
-    template = load("cpu")
-    steady = profile_of(journal_of(candidates(0), [1.0] * 16), template, "x")
-    drifting = profile_of(journal_of(candidates(0), [1.0] * 9 + [2.0] * 7), template, "x")
+def test_a_drift_of_the_machine_cancels(planted: Any) -> None:
+    """Twice as slow in 11 of 24 samples: the reference's median, and so each point, stays."""
+    bench, template = planted(), load("cpu")
+    steady = profile_of(bench.journal(24), template, "x")
+    drifting = profile_of(bench.journal(24, [1.0] * 13 + [2.0] * 11), template, "x")
     assert fps(drifting) == pytest.approx(fps(steady), rel=1e-12)
-    for point in steady.points:
-        assert point.latency_ms == pytest.approx(predict_ms(TRUTH, point.arch, point.resolution))
+    for job, point in zip(planned(24), drifting.points, strict=True):
+        assert point.latency_ms == pytest.approx(bench.latency_ms(job))
+        assert point.parts_ms is not None
+        assert sum(point.parts_ms.values()) == pytest.approx(point.latency_ms, rel=1e-4)
 
 
-def test_a_drift_in_half_of_the_samples_leaves_every_ratio() -> None:
+def test_a_drift_in_half_of_the_samples_leaves_every_ratio(planted: Any) -> None:
     """Which half was the usual one nobody can tell; that moves all points alike."""
-    template = load("cpu")
-    steady = fps(profile_of(journal_of(candidates(0), [1.0] * 16), template, "x"))
-    drifting = fps(profile_of(journal_of(candidates(0), [1.0, 2.0] * 8), template, "x"))
+    bench, template = planted(), load("cpu")
+    steady = fps(profile_of(bench.journal(24), template, "x"))
+    drifting = fps(profile_of(bench.journal(24, [1.0, 2.0] * 12), template, "x"))
     ratios = np.array(drifting) / np.array(steady)
-    assert ratios == pytest.approx(np.full(16, ratios[0]), rel=1e-12)
+    assert ratios == pytest.approx(np.full(24, ratios[0]), rel=1e-12)
     assert 0.5 <= ratios[0] <= 1
 
 
-def test_the_fit_of_planted_timings_predicts_networks_that_it_never_saw() -> None:
-    fitted = profile_of(journal_of(candidates(0), [1.0, 1.3, 0.8] * 9), load("cpu"), "x")
-    known = fitted.calibration("onnxruntime", "fp32")
-    unseen = list(islice(candidates(7), 24, 64))
-    for arch, resolution in unseen:
-        assert predict_ms(known.model, arch, resolution) == pytest.approx(
-            predict_ms(TRUTH, arch, resolution), rel=1e-3
+def test_the_fit_of_planted_timings_predicts_networks_that_it_never_saw(planted: Any) -> None:
+    bench = planted()
+    journal = bench.journal(FIRST, [1.0, 1.3, 0.8] * 25)
+    fitted = profile_of(journal, load("cpu"), "x")
+    model = fitted.calibration("onnxruntime", "fp32").model
+    chance = random.Random(5)
+    for _ in range(60):
+        unseen = Job(*random_candidate(chance), "fp32")
+        assert predict_ms(model, unseen.arch, unseen.resolution) == pytest.approx(
+            bench.latency_ms(unseen), rel=1e-4
         )
-    assert np.abs(known.residuals).max() < 1e-3
 
 
-def test_the_profile_passes_through_its_file(tmp_path: Path) -> None:
-    fitted = profile_of(journal_of(candidates(0), [1.0] * 16), load("cpu"), "my-pc")
+def test_the_profile_passes_through_its_file(tmp_path: Path, planted: Any) -> None:
+    fitted = profile_of(planted().journal(24), load("cpu"), "my-pc")
     path = tmp_path / "my-pc.json"
     path.write_text(json.dumps(fitted.model_dump(mode="json", by_alias=True, exclude_none=True)))
     assert load(str(path)) == fitted
     assert fitted.name == "my-pc"
-    assert fitted.machine == this_machine(2).model_copy(update={"reference_ms": REFERENCE_MS})
+    assert fitted.machine == this_machine("onnxruntime", 2).model_copy(
+        update={"reference_ms": 10.0}
+    )
     assert {(p.evidence, p.runtime, p.precision) for p in fitted.points} == {
         ("measured", "onnxruntime", "fp32")
     }
-    assert len(fitted.calibrations[0].residuals) == len(fitted.points) == 16
+    (known,) = fitted.calibrations
+    assert isinstance(known.model, PartModel)
+    assert len(known.residuals) == len(fitted.points) == 24
     assert fitted.derivations == ()
     assert {fact.name: fact.value for fact in fitted.hardware}["threads"] == "2"
 
 
-def test_the_machine_tells_what_a_timing_depends_on() -> None:
-    import onnxruntime
+def test_unreliable_timings_are_left_out(planted: Any) -> None:
+    """Every tenth sample took three times as long, and its runs disagreed: nothing of it stays."""
+    bench = planted()
+    good = bench.journal(30)
+    bench.spread, bench.factor = 0.5, 3.0
+    spoiled = [bench.harvest(job) for job in planned(30)]
+    samples = [
+        bad if index % 10 == 9 else sample
+        for index, (sample, bad) in enumerate(zip(good.samples, spoiled, strict=True))
+    ]
+    assert [index for index, sample in enumerate(samples) if not sample.reliable] == [9, 19, 29]
+    mixed = good.model_copy(update={"samples": tuple(samples)})
+    kept = good.model_copy(update={"samples": tuple(s for s in samples if s.reliable)})
+    found = profile_of(mixed, load("cpu"), "x")
+    assert found == profile_of(kept, load("cpu"), "x")
+    assert len(found.points) == 27
+    assert "27 whole networks" in found.calibrations[0].source
 
-    here = this_machine(3)
-    assert here.threads == 3
-    assert here.processor
-    assert here.versions["onnxruntime"] == onnxruntime.__version__
-    assert here.versions.keys() >= {"rts2", "python"}
-    assert date.fromisoformat(here.date) <= date.today()
+
+def test_too_few_reliable_timings_name_the_remedy(planted: Any) -> None:
+    bench = planted()
+    journal = bench.journal(NEEDED)
+    spoiled = journal.samples[3].model_copy(update={"reliable": False})
+    samples = (*journal.samples[:3], spoiled, *journal.samples[4:])
+    for held, count in ((samples, 23), (samples[:3], 3), (samples[3:4], 0), ((), 0)):
+        with pytest.raises(Rts2Error, match=f"^{count} reliable timings are too few") as error:
+            profile_of(journal.model_copy(update={"samples": held}), load("cpu"), "x")
+        assert "a longer --budget" in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_each_precision_has_its_own_tables_and_is_told_as_supported(planted: Any) -> None:
+    bench = planted("openvino")
+    bench.precisions = ("fp32", "bf16")
+    template = load("cpu")
+    found = profile_of(bench.journal(2 * 40), template, "x")
+    assert [(c.runtime, c.precision) for c in found.calibrations] == [
+        ("openvino", "fp32"),
+        ("openvino", "bf16"),
+    ]
+    for known in found.calibrations:
+        points = found.points_of("openvino", known.precision)
+        assert len(known.residuals) == len(points) == 40
+    single, half = (known.model for known in found.calibrations)
+    for job in planned(10, seed=4):
+        assert predict_ms(half, job.arch, job.resolution) == pytest.approx(
+            0.6 * predict_ms(single, job.arch, job.resolution), rel=1e-4
+        )
+    told = {support.precision: support for support in found.precisions}
+    assert len(told) == len(found.precisions)
+    for precision in ("fp32", "bf16"):
+        assert told[precision].supported
+        assert "OpenVINO" in told[precision].reason
+    before = {s.precision: s for s in template.precisions if s.precision not in ("fp32", "bf16")}
+    assert {name: s for name, s in told.items() if name in before} == before
+
+
+def test_a_profile_of_a_runtime_says_that_it_has_it(planted: Any) -> None:
+    """Whoever reads the profile, a bundle too, finds the runtime that was timed."""
+    found = profile_of(planted("openvino").journal(24), load("cpu"), "x")
+    assert "openvino" in {known.runtime for known in found.runtimes}
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> Bench:
     """A real bench on one thread whose reference is small, and that counts no more than needed."""
-    from rts2.profiles import measure, timing
-
     monkeypatch.setattr(measure, "REFERENCE", (Arch(c=1, stages=1, d_max=6), (64, 64)))
     monkeypatch.setattr(timing, "WARM_UP_S", 0.01)
     monkeypatch.setattr(timing, "MIN_SECONDS", 0.01)
-    return Bench(1)
+    return Bench("onnxruntime", 1)
 
 
-def test_a_bench_times_real_networks_and_files(quick: Bench, tmp_path: Path) -> None:
-    small = Arch(c=1, stages=1, d_max=6, conv3d=(4,), semantic=False)
-    path = tmp_path / "small.onnx"
-    export(build(small), path, (96, 64), UNTRAINED)
-    for timing in (quick.time(small, (96, 64)), quick.time_file(path)):
-        assert timing.runs >= 10
-        assert 0 < timing.median_ms <= timing.p95_ms
-        assert timing.reference_ms > 0
+def test_a_bench_times_real_networks_as_a_whole_and_by_part(quick: Bench) -> None:
+    job = Job(SMALL, (96, 64), "fp32")
+    whole = quick.time(job)
+    assert whole.runs >= 10
+    assert 0 < whole.median_ms <= whole.p95_ms
+    assert whole.reference_ms > 0
+    sample = quick.harvest(job)
+    assert (sample.arch, sample.resolution, sample.precision) == (SMALL, (96, 64), "fp32")
+    assert sample.parts_ms.keys() == {part.name for part in parts(ops(SMALL, (96, 64)))}
+    assert sum(sample.parts_ms.values()) == pytest.approx(sample.latency_ms)
+    assert min(sample.latency_ms, sample.reference_ms, sample.ratio) > 0
 
 
 def test_more_work_takes_longer(quick: Bench) -> None:
     """About 200 times the multiply-adds: no load of the machine turns that around."""
-    small = quick.time(Arch(c=1, stages=1, d_max=6, conv3d=(4,), semantic=False), (96, 64))
-    large = quick.time(Arch(c=16, stages=3), (320, 192))
-    assert large.median_ms / large.reference_ms > 3 * small.median_ms / small.reference_ms
+    small = quick.time(Job(SMALL, (96, 64), "fp32"))
+    large = quick.time(Job(Arch(c=16, stages=3), (320, 192), "fp32"))
+    assert large.ratio > 3 * small.ratio

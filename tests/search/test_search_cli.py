@@ -12,9 +12,13 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from rts2.profiles.profile import names
+from rts2.model.arch import Arch
+from rts2.model.files import write_json
+from rts2.profiles.latency import predict_ms
+from rts2.profiles.profile import Profile, names
 from rts2.search.cli import search
 from rts2.search.result import read
+from rts2.search.space import Space
 
 TX2 = ("--device", "tx2", "--target-fps", "10")
 FILES = {"front.json", "front.csv", "front.png", "deployment.json"}
@@ -244,6 +248,71 @@ def test_a_profile_file_and_an_accuracy_file_are_taken(run: Command, tmp_path: P
     assert profile["title"] in run(*arguments).out
 
 
+def written(profile: Profile, path: Path) -> str:
+    write_json(path, profile.model_dump(mode="json", by_alias=True, exclude_none=True))
+    return str(path)
+
+
+def test_a_profile_by_parts_is_searched_as_its_tables_say(
+    run: Command, by_parts: Profile, tmp_path: Path
+) -> None:
+    """At a size that was timed, between the two sizes, and outside of them."""
+    device = written(by_parts, tmp_path / "made-up.json")
+    model = by_parts.calibrations[0].model
+    timed = {(p.arch, p.resolution): p.latency_ms for p in by_parts.points}
+    kinds = {
+        (1242, 375): {"measured", "interpolated"},
+        (960, 288): {"interpolated"},
+        (320, 96): {"extrapolated"},
+    }
+    for (width, height), told in kinds.items():
+        asked = ("--device", device, "--target-fps", "40", "--resolution", f"{width}x{height}")
+        found = run(*asked, "--allow-extrapolated", "--json").json
+        assert found["space"]["size"] == Space().size()
+        assert {point["evidence"]["latency"] for point in found["front"]} == told
+        assert found["selected"]["fps"] >= 40
+        for point in found["front"]:
+            arch = Arch.model_validate(point["arch"])
+            predicted = predict_ms(model, arch, (width, height))
+            expected = timed.get((arch, (width, height)), predicted)
+            assert point["latency_ms"] == pytest.approx(expected, rel=1e-9)
+            assert point["fps_low"] < point["fps"] < point["fps_high"]
+
+
+def test_a_profile_of_this_machine_is_searched_in_silence(
+    run: Command, by_parts: Profile, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    done = run("--device", written(by_parts, tmp_path / "x.json"), "--target-fps", "40", "--json")
+    assert (done.code, done.err, caplog.text) == (0, "", "")
+
+
+def test_a_profile_of_another_machine_is_searched_with_what_differs(
+    by_parts: Profile, tmp_path: Path
+) -> None:
+    """On stderr alone, and without loading the runtime whose version it tells."""
+    own = by_parts.machine
+    assert own is not None
+    machine = own.model_copy(
+        update={
+            "processor": "[red] Pentium",
+            "threads": own.threads + 7,
+            "versions": {**own.versions, "onnxruntime": "0.1"},
+        }
+    )
+    other = by_parts.model_copy(update={"machine": machine})
+    device = written(other, tmp_path / "x.json")
+    asked = ["--device", device, "--target-fps", "40", "--json", "--out", str(tmp_path / "out")]
+    done = in_a_fresh_process(LIGHT, asked)
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["selected"]["fps"] >= 40
+    processor, threads, version, remedy = done.stderr.splitlines()
+    assert processor == f"note: the profile is of [red] Pentium; this is {own.processor}"
+    assert threads == f"note: the profile is for {own.threads + 7} threads, not {own.threads}"
+    now = own.versions["onnxruntime"]
+    assert version == f"note: the profile was fitted with onnxruntime 0.1, not {now}"
+    assert remedy.startswith(f"note: rts2-profile fit --device {device} --out ")
+
+
 def shipped() -> dict[str, Any]:
     text = (resources.files("rts2.profiles") / "devices" / "tx2.json").read_text("utf-8")
     found: dict[str, Any] = json.loads(text)
@@ -403,14 +472,16 @@ def in_a_fresh_process(code: str, arguments: Sequence[str]) -> subprocess.Comple
 HEAVY = ("torch", "onnx", "onnxruntime", "optuna", "scipy", "pandas", "sklearn")
 
 
+LIGHT = (
+    "import sys; from rts2.search.cli import search; code = search();"
+    f"loaded = [name for name in {HEAVY} if name in sys.modules];"
+    "sys.exit(f'loaded: {loaded}' if loaded else code)"
+)
+
+
 def test_a_whole_search_loads_no_heavy_library_and_says_nothing_else(tmp_path: Path) -> None:
     """The main command answers at once because it never waits for what it does not use."""
-    code = (
-        "import sys; from rts2.search.cli import search; code = search();"
-        f"loaded = [name for name in {HEAVY} if name in sys.modules];"
-        "sys.exit(f'loaded: {loaded}' if loaded else code)"
-    )
-    done = in_a_fresh_process(code, [*TX2, "--json", "--out", str(tmp_path / "out")])
+    done = in_a_fresh_process(LIGHT, [*TX2, "--json", "--out", str(tmp_path / "out")])
     assert done.stderr == ""
     assert done.returncode == 0
     assert json.loads(done.stdout)["selected"]["d1_all"] <= 4.70

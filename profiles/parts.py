@@ -1,0 +1,324 @@
+"""Latency by parts: what each part of the network takes on one machine, as tables.
+
+A network of the family `rts2net` is a chain of parts (the encoder, an embedding, a volume, …), and
+each part depends on one or two numbers: channels c, planes, the width of its 3D convs. Timing whole
+networks node by node fills a table of every part, at every value that was timed: what a runtime
+makes of 15, 16 or 17 channels stands in the table as it is, and no curve smooths it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import chain, product
+from math import prod
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from ..model.arch import FACTORS, SPACE_C, SPACE_CONV3D, SPACE_D_MAX, STRIDES, Arch
+from ..model.errors import Rts2Error
+from ..model.ops import Op, ops
+
+Floats = NDArray[np.float64]
+Milliseconds = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class Part(NamedTuple):
+    """One part of one network: what its cost depends on."""
+
+    name: str
+    at: tuple[int, ...]
+    """What the part's axes say, in the order of `AXES`."""
+    pixels: int
+    """Of the network's input."""
+
+
+AXES: dict[str, tuple[str, ...]] = {
+    "encoder": ("c",),
+    "context": ("c",),
+    **{f"embedding.{stage}": ("c",) for stage in range(3)},
+    **{f"volume.{stage}": ("c", "planes") for stage in range(3)},
+    **{f"regularize.{stage}": ("width", "planes") for stage in range(3)},
+    **{f"semantics.{stage}": ("c",) for stage in range(3)},
+    **{f"refine.{stage}": ("planes",) for stage in range(3)},
+    **{f"head.{stage}": ("semantic",) for stage in range(3)},
+}
+"""The parts of a network, and what each depends on."""
+
+_VALUES = {"c": SPACE_C, "semantic": (0, 1)}
+
+
+def axis_values(part: str) -> tuple[tuple[int, ...], ...]:
+    """The values of the searched space along each axis of a part."""
+    stage = int(part[-1]) if part[-1].isdigit() else 0
+    planes = SPACE_D_MAX if stage == 0 else (Arch().planes(stage),)
+    known = _VALUES | {"planes": planes, "width": SPACE_CONV3D[stage]}
+    return tuple(known[axis] for axis in AXES[part])
+
+
+_ROOMS = (
+    (re.compile(r"encoder\.context\b"), "context"),
+    (re.compile(r"encoder\b"), "encoder"),
+    (re.compile(r"disparity\.levels\.(\d)"), "embedding"),
+    (re.compile(r"(?:semantic\.levels|classify)\.(\d)"), "semantics"),
+    (re.compile(r"(volume|regularize|refine)\.(\d)"), ""),
+    (re.compile(r"output\b"), "head"),
+)
+
+
+def part_of(node: str, stages: int) -> str:
+    """The part that a node of an exported graph belongs to, by its name.
+
+    Raises `Rts2Error` for a node of no part.
+    """
+    for pattern, name in _ROOMS:
+        if found := pattern.match(node):
+            if name == "head":
+                return f"head.{stages - 1}"
+            return ".".join(filter(None, (name, *found.groups())))
+    raise Rts2Error(f"the node {node} belongs to no part of the network, so its time is nobody's")
+
+
+def per_part(node_ms: Mapping[str, float], arch: Arch, total_ms: float) -> dict[str, float]:
+    """Sums of times by node over each part, scaled so that they add up to `total_ms`."""
+    found: dict[str, float] = {}
+    for node, ms in node_ms.items():
+        part = part_of(node, arch.stages)
+        found[part] = found.get(part, 0.0) + ms
+    scale = total_ms / sum(found.values())
+    return {part: ms * scale for part, ms in found.items()}
+
+
+_ANCHORS: dict[str, str] = {
+    "encoder.stem.0.conv": "encoder",
+    "encoder.context.pool": "context",
+    **{f"disparity.{stage}.0.conv": f"embedding.{stage}" for stage in range(3)},
+    **{f"volume.{stage}": f"volume.{stage}" for stage in range(3)},
+    **{f"regularize.{stage}.0.conv": f"regularize.{stage}" for stage in range(3)},
+    **{f"classify.{stage}": f"semantics.{stage}" for stage in range(3)},
+    **{f"refine.{stage}.compress": f"refine.{stage}" for stage in range(3)},
+    "head.disparity": "head",
+}
+"""The step of an op list that tells each part's numbers."""
+
+_KNOWN = {"around", "semantic", *(name.split(".")[0] for name in _ANCHORS)}
+"""How the names of the steps begin."""
+
+
+def parts(steps: Sequence[Op]) -> tuple[Part, ...]:
+    """The parts that an op list of the family `rts2net` runs through.
+
+    Raises `Rts2Error` that names a step of another family.
+    """
+    for op in steps:
+        if op.name.split(".")[0] not in _KNOWN:
+            raise Rts2Error(
+                f"{op.name} has no cost in a profile by parts, which knows rts2net alone; "
+                "time the network itself: rts2-profile measure"
+            )
+    semantic = int(any(op.name == "head.semantic" for op in steps))
+    return tuple(_part(_ANCHORS[op.name], op, semantic) for op in steps if op.name in _ANCHORS)
+
+
+def _part(name: str, op: Op, semantic: int) -> Part:
+    inputs, output = op.inputs[0], op.output
+    if name == "head":
+        stride = output[-1] // inputs[-1]
+        stage = STRIDES.index(stride)
+        return Part(f"head.{stage}", (semantic,), output[-1] * output[-2])
+    stage = int(name[-1]) if name[-1].isdigit() else 0
+    room = name.split(".")[0]
+    at = {
+        "encoder": (output[1],),
+        "context": (inputs[1] // FACTORS[0],),
+        "embedding": (output[1] // FACTORS[stage],),
+        "volume": (inputs[1] // FACTORS[stage], output[1]),
+        "regularize": (output[1], output[2]),
+        "semantics": (inputs[1] // FACTORS[stage],),
+        "refine": (output[1],),
+    }[room]
+    stride = {"encoder": 1, "context": STRIDES[0]}.get(room, STRIDES[stage])
+    sides = inputs if room == "context" else output
+    return Part(name, at, sides[-1] * sides[-2] * stride**2)
+
+
+class PartTable(BaseModel):
+    """The cost of one part at every value of its axes, for each input size."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    axes: tuple[tuple[int, ...], ...]
+    ms: tuple[tuple[Milliseconds, ...], ...]
+    """One row a size; a row is laid out with the last axis running fastest."""
+
+    @model_validator(mode="after")
+    def _shaped(self) -> PartTable:
+        cells = prod(len(axis) for axis in self.axes)
+        if any(len(row) != cells for row in self.ms):
+            raise ValueError(f"its axes have {cells} places and a row of ms has another number")
+        if any(list(axis) != sorted(set(axis)) for axis in self.axes):
+            raise ValueError("the values of an axis must rise")
+        return self
+
+    @cached_property
+    def grid(self) -> Floats:
+        """(sizes, len(axis), …), in milliseconds."""
+        return np.array(self.ms).reshape(len(self.ms), *(len(axis) for axis in self.axes))
+
+    def at(self, place: tuple[int, ...]) -> Floats:
+        """The cost at each size, (sizes,): linear between values, the last one beyond them."""
+        values = self.grid
+        for axis, value in reversed(list(zip(self.axes, place, strict=True))):
+            position = float(np.interp(value, axis, np.arange(len(axis))))
+            low = min(int(position), max(len(axis) - 2, 0))
+            share = position - low
+            upper = values[..., min(low + 1, len(axis) - 1)]
+            values = (1 - share) * values[..., low] + share * upper
+        return values
+
+
+class PartModel(BaseModel):
+    """The latency of every network of the space on one machine, runtime and precision."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    form: Literal["parts"] = "parts"
+    pixels: tuple[Annotated[int, Field(gt=0)], ...] = Field(min_length=1)
+    """Of the input sizes that were timed, rising."""
+    tables: dict[str, PartTable]
+
+    @model_validator(mode="after")
+    def _whole(self) -> PartModel:
+        if list(self.pixels) != sorted(set(self.pixels)):
+            raise ValueError("pixels must rise")
+        for name, table in self.tables.items():
+            if name not in AXES:
+                raise ValueError(f"{name} is no part; known are {', '.join(AXES)}")
+            if len(table.axes) != len(AXES[name]) or len(table.ms) != len(self.pixels):
+                raise ValueError(f"{name} needs the axes {AXES[name]} and a row a size")
+        return self
+
+    def cost_ms(self, part: Part) -> float:
+        """What one part takes; `Rts2Error` names a part that nobody timed."""
+        table = self.tables.get(part.name)
+        if table is None:
+            raise Rts2Error(f"{part.name} has no cost in this profile; fit it again")
+        return _scaled(self.pixels, table.at(part.at), part.pixels)
+
+    def total_ms(self, found: Iterable[Part]) -> float:
+        """What parts take one after the other."""
+        return sum(self.cost_ms(part) for part in found)
+
+
+def _scaled(known: Sequence[int], costs: Floats, pixels: int) -> float:
+    """A cost at another size: linear in the pixels, and below the smallest at least in proportion
+    to it.
+    """
+    if len(known) == 1:
+        return float(costs[0] * pixels / known[0])
+    upper = min(max(int(np.searchsorted(known, pixels)), 1), len(known) - 1)
+    low, high = known[upper - 1], known[upper]
+    share = (pixels - low) / (high - low)
+    linear = costs[upper - 1] + share * (costs[upper] - costs[upper - 1])
+    return float(max(linear, costs[0] * min(pixels / known[0], 1.0)))
+
+
+class Harvest(NamedTuple):
+    """One timed network: what each of its parts took, in milliseconds."""
+
+    arch: Arch
+    resolution: tuple[int, int]
+    ms: Mapping[str, float]
+
+
+def fit_parts(harvests: Sequence[Harvest]) -> PartModel:
+    """The tables of every part from networks that were timed part by part.
+
+    A value of the first axis that was timed keeps what was timed, over a smooth base that says
+    how the cost goes along the other axis; values between are interpolated.
+
+    Raises:
+        Rts2Error: a part was not timed at one of the sizes.
+    """
+    return _fit([_observed(harvest) for harvest in harvests])
+
+
+def left_out(harvests: Sequence[Harvest]) -> Floats:
+    """ln(true / predicted) of each network, predicted from tables without it."""
+    seen = [_observed(harvest) for harvest in harvests]
+    found = []
+    for index, own in enumerate(seen):
+        predicted = _fit([*seen[:index], *seen[index + 1 :]]).total_ms(part for part, _ in own)
+        found.append(np.log(sum(ms for _, ms in own) / predicted))
+    return np.array(found)
+
+
+Observed = list[tuple[Part, float]]
+
+ROUNDS = 4
+"""How often base and corrections are fitted in turn: a base that need not follow a staircase along
+the first axis tells better how the cost goes along the other one."""
+
+
+def _observed(harvest: Harvest) -> Observed:
+    steps = ops(harvest.arch, harvest.resolution)
+    return [(part, harvest.ms[part.name]) for part in parts(steps)]
+
+
+def _fit(networks: Sequence[Observed]) -> PartModel:
+    seen: dict[tuple[str, int], Observed] = {}
+    for part, ms in chain.from_iterable(networks):
+        seen.setdefault((part.name, part.pixels), []).append((part, ms))
+    pixels = sorted({size for _, size in seen})
+    tables = {
+        name: PartTable(
+            axes=axis_values(name),
+            ms=tuple(_row(name, seen.get((name, size), []), size) for size in pixels),
+        )
+        for name in AXES
+    }
+    return PartModel(pixels=tuple(pixels), tables=tables)
+
+
+def _row(name: str, seen: Observed, pixels: int) -> tuple[float, ...]:
+    """One part's cost at every place of its axes, at one size."""
+    if not seen:
+        raise Rts2Error(f"no network with {name} was timed at {pixels} pixels; time more")
+    places = np.array([part.at for part, _ in seen], float)
+    truth = np.array([ms for _, ms in seen])
+    first, member = np.unique(places[:, 0], return_inverse=True)
+    kept = np.zeros(len(first))
+    for _ in range(ROUNDS):
+        base = _Base(places, truth / np.exp(kept[member]))
+        told = np.log(truth / base(places))
+        kept = np.bincount(member, told) / np.bincount(member)
+    grid = np.array(list(product(*axis_values(name))), float)
+    cost = base(grid) * np.exp(np.interp(grid[:, 0], first, kept))
+    return tuple(float(f"{ms:.6g}") for ms in cost)
+
+
+class _Base:
+    """A smooth cost over a part's axes: non-negative least squares on relative error."""
+
+    def __init__(self, places: Floats, truth: Floats) -> None:
+        from scipy.optimize import nnls
+
+        columns = self._columns(places) / truth[:, None]
+        self._scale = columns.max(0)
+        self._values, _ = nnls(columns / self._scale, np.ones(len(truth)))
+
+    def __call__(self, places: Floats) -> Floats:
+        return np.asarray(self._columns(places) / self._scale @ self._values)
+
+    @staticmethod
+    def _columns(places: Floats) -> Floats:
+        """1, x, x² of the first axis, each times 1 and the second axis where there is one."""
+        first = places[:, 0]
+        powers = np.stack([np.ones_like(first), first + 1e-9, first**2 + 1e-9], 1)
+        if places.shape[1] == 1:
+            return powers
+        return np.concatenate([powers, powers * places[:, 1:2]], 1)
