@@ -350,16 +350,27 @@ def _fit(options: argparse.Namespace) -> None:
     else:
         fitted = _fit_here(options, template, path)
     write_json(path, fitted.model_dump(mode="json", by_alias=True, exclude_none=True))
-    residuals = fitted.calibrations[0].residuals
-    error = summary(residuals)
+    rows = [
+        {
+            "runtime": known.runtime,
+            "precision": known.precision,
+            "n": len(known.residuals),
+            **summary(known.residuals),
+        }
+        for known in fitted.calibrations
+    ]
     if options.json:
-        result = {"schema": "rts2.profile-fit/1", "file": str(path), "n": len(residuals), **error}
+        first = {name: rows[0][name] for name in ("n", "mape", "max_ape", "within_5", "within_10")}
+        result = {"schema": "rts2.profile-fit/1", "file": str(path), **first, "calibrations": rows}
         print_json(result)
         return
-    _print(
-        f"{fitted.title}: {len(residuals)} timings, each left out in turn: "
-        f"mean error {error['mape']:.1%}, worst {error['max_ape']:.1%}\nwritten   {path}"
-    )
+    for row in rows:
+        _print(
+            f"{fitted.title}, {row['precision']} on {row['runtime']}: "
+            f"{row['n']} timings, each left out in turn: "
+            f"mean error {row['mape']:.1%}, worst {row['max_ape']:.1%}"
+        )
+    _print(f"written   {path}")
 
 
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:

@@ -287,7 +287,11 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
             "precisions": _precisions(template, precisions, title),
             "runtimes": _runtimes(template, journal),
             "calibrations": tuple(
-                _calibrated([point for point in points if point.precision == precision], source)
+                _calibrated(
+                    [point for point in points if point.precision == precision],
+                    [sample for sample in journal.samples if sample.precision == precision],
+                    source,
+                )
                 for precision in precisions
             ),
             "derivations": (),
@@ -334,10 +338,13 @@ def _point(sample: Sample, runtime: Runtime, usual_ms: float, source: str) -> Po
     )
 
 
-def _calibrated(points: Sequence[Point], source: str) -> Calibration:
+def _calibrated(points: Sequence[Point], timed: Sequence[Sample], source: str) -> Calibration:
+    """Tables from the reliable ones of all that was timed in a precision."""
     if len(points) < NEEDED:
         raise _too_few(len(points))
-    told = f"times by node of {len(points)} whole networks; {source}"
+    left_out = len(timed) - len(points)
+    told = f", {left_out} more were unreliable" if left_out else ""
+    told = f"times by node of {len(points)} whole networks{told}; {source}"
     return calibrated(points, FORMS["parts"], told)
 
 

@@ -159,7 +159,7 @@ def test_a_table_of_networks_equals_single_predictions(device: str) -> None:
     assert together == pytest.approx(np.array(apart), rel=1e-12)
 
 
-@pytest.mark.parametrize("device", names())
+@pytest.mark.parametrize("device", ["tx2", "rtx2080ti"])
 def test_predictions_equal_a_plain_loop(device: str) -> None:
     profile = load(device)
     forms = [known.model for known in profile.calibrations]

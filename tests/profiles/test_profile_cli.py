@@ -309,6 +309,8 @@ def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, tmp_pat
     assert (found["schema"], found["file"]) == ("rts2.profile-fit/1", str(path))
     assert found["n"] == 40
     assert found["mape"] < 0.1
+    told = [(row["runtime"], row["precision"], row["n"]) for row in found["calibrations"]]
+    assert told == [("onnxruntime", "fp32", 40)]
     fitted = load(str(path))
     assert (fitted.name, len(fitted.points)) == ("my-cpu", 40)
     assert isinstance(fitted.calibrations[0].model, PartModel)
