@@ -139,7 +139,7 @@ def _camera(rng: np.random.Generator, size: tuple[int, int]) -> Camera:
     """KITTI's camera, or a random window of it; larger images have more pixels per degree."""
     from .shading import Camera
 
-    scale = max(1.0, size[0] / KITTI_SIZE[0], size[1] / KITTI_SIZE[1])
+    scale = _scale(size)
     room = [scale * whole - side for whole, side in zip(KITTI_SIZE, size, strict=True)]
     x, y = (rng.uniform(0, max(space, 0.0)) for space in room)
     zoom = 1.0 if size == KITTI_SIZE else float(np.exp(rng.normal(0, 0.1)))
@@ -160,8 +160,12 @@ def _sides(eye: Camera) -> tuple[float, float]:
 
 def _nearest_m(eye: Camera) -> float:
     """Zooming in moves the nearest things away, so that disparities keep their limit."""
-    scale = max(1.0, eye.size[0] / KITTI_SIZE[0], eye.size[1] / KITTI_SIZE[1])
-    return NEAREST_M * eye.focal_px / (FOCAL_PX * scale)
+    return NEAREST_M * eye.focal_px / (FOCAL_PX * _scale(eye.size))
+
+
+def _scale(size: tuple[int, int]) -> float:
+    """How many times as large as KITTI's frame an image is; 1 for windows into it."""
+    return max(1.0, size[0] / KITTI_SIZE[0], size[1] / KITTI_SIZE[1])
 
 
 def _pose(rng: np.random.Generator, yaw: float) -> NDArray[np.float64]:
