@@ -10,7 +10,7 @@ from typing import Any
 
 from ..model.arch import Arch, Precision
 from ..model.errors import Rts2Error
-from .calibrate import recalibrated, summary
+from .calibrate import summary
 from .conformal import half_width
 from .latency import predict_ms
 from .measure import Bench, Job, random_candidate
@@ -42,9 +42,12 @@ class Comparison:
 
 
 def held_out(profile: Profile) -> list[Comparison]:
-    """Every point of the profile, predicted from all the others of its runtime and precision."""
+    """Every point of the profile, predicted from all the others of its runtime and precision.
+
+    The errors are those that stand in the profile: `recalibrated` computes them anew.
+    """
     found = []
-    for known in recalibrated(profile).calibrations:
+    for known in profile.calibrations:
         points = profile.points_of(known.runtime, known.precision)
         residuals = known.residuals
         for point, residual in zip(points, residuals, strict=True):
@@ -62,7 +65,7 @@ def held_out(profile: Profile) -> list[Comparison]:
 
 
 def groups_held_out(profile: Profile) -> list[dict[str, Any]]:
-    """The errors of whole families and stage counts left out, one entry per calibration.
+    """The profile's errors of whole families and stage counts left out, one entry per calibration.
 
     Fractions, and null where too few points remain to fit.
     """
@@ -72,7 +75,7 @@ def groups_held_out(profile: Profile) -> list[dict[str, Any]]:
             "precision": known.precision,
             **known.held_out.model_dump(mode="json"),
         }
-        for known in recalibrated(profile).calibrations
+        for known in profile.calibrations
         if known.held_out is not None
     ]
 

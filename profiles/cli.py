@@ -221,10 +221,12 @@ def _model_told(model: LatencyModel | PartModel) -> str:
 
 
 def _check(options: argparse.Namespace) -> None:
+    from .calibrate import recalibrated
     from .check import groups_held_out, held_out, report
 
     known = load(options.device)
     if options.samples is None:
+        known = recalibrated(known)
         comparisons = held_out(known)
         result = report(known, comparisons) | {"held_out": groups_held_out(known)}
     else:
