@@ -25,7 +25,7 @@ from rts2.profiles.kit.folder import write
 from rts2.profiles.kit.plan import NETWORKS, networks
 from rts2.profiles.kit.results import Results, timings
 from rts2.profiles.latency import LatencyModel, Steps, latencies_ms
-from rts2.profiles.measure import random_candidate
+from rts2.profiles.plan import random_candidate
 from rts2.profiles.profile import (
     Calibration,
     Point,

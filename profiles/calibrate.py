@@ -16,7 +16,8 @@ from ..model.ops import ops
 from .heldout import hold_outs
 from .kit import fewshot
 from .latency import Floats, LatencyModel, Steps, latencies_ms
-from .parts import Harvest, PartModel, fit_parts, left_out
+from .partfit import Harvest, fit_parts, left_out
+from .parts import PartModel
 from .profile import Calibration, Point, Profile
 
 Form = LatencyModel | PartModel

@@ -13,7 +13,8 @@ from ..model.errors import Rts2Error
 from .calibrate import summary
 from .conformal import half_width
 from .latency import predict_ms
-from .measure import Bench, Job, random_candidate
+from .measure import Bench
+from .plan import Job, random_candidate
 from .profile import Profile, Resolution, Runtime
 
 CHECK_SEED = 1_000_003
@@ -80,30 +81,45 @@ def groups_held_out(profile: Profile) -> list[dict[str, Any]]:
     ]
 
 
+RETRIES = 2
+"""How often a network is timed again, after all the others, while its timing is unreliable."""
+
+
 def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[Comparison]:
     """Random networks that no fit has seen, timed on this machine now, in all of the profile's
-    precisions.
+    precisions; those whose timing is unreliable come last, timed again.
 
     What counts is the ratio to the reference beside it: a machine drifts from day to day.
     """
     chance = random.Random(CHECK_SEED + seed)
-    machine = profile.machine
     precisions = [c.precision for c in profile.calibrations if c.runtime == bench.runtime]
-    for _ in range(samples):
-        job = Job(*random_candidate(chance), chance.choice(precisions))
-        timing = bench.time(job)
-        then = (machine and machine.reference_ms) or timing.reference_ms
-        known = profile.calibration(bench.runtime, job.precision)
-        yield Comparison(
-            job.arch,
-            job.precision,
-            bench.runtime,
-            job.resolution,
-            1000 / (timing.ratio * then),
-            1000 / predict_ms(known.model, job.arch, job.resolution),
-            timing.reference_ms / then,
-            timing.reliable,
-        )
+    drawn = [Job(*random_candidate(chance), chance.choice(precisions)) for _ in range(samples)]
+    for left in range(RETRIES, -1, -1):
+        again = []
+        for job in drawn:
+            found = _compared(profile, bench, job)
+            if found.reliable or not left:
+                yield found
+            else:
+                again.append(job)
+        drawn = again
+
+
+def _compared(profile: Profile, bench: Bench, job: Job) -> Comparison:
+    """One network, timed now."""
+    timing = bench.time(job)
+    then = (profile.machine and profile.machine.reference_ms) or timing.reference_ms
+    known = profile.calibration(bench.runtime, job.precision)
+    return Comparison(
+        job.arch,
+        job.precision,
+        bench.runtime,
+        job.resolution,
+        1000 / (timing.ratio * then),
+        1000 / predict_ms(known.model, job.arch, job.resolution),
+        timing.reference_ms / then,
+        timing.reliable,
+    )
 
 
 def coverage(profile: Profile, comparisons: Sequence[Comparison], confidence: float) -> float:

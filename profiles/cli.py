@@ -36,9 +36,13 @@ from .runtimes import RUNTIMES
 if TYPE_CHECKING:
     from .check import Comparison
     from .latency import LatencyModel
-    from .measure import Bench, Job
+    from .measure import Bench
+    from .plan import Job
 
 CONFIDENCE = 0.9
+
+RESERVE_S, FITTING_S = 5.0, 0.12
+"""What of a fit's budget is kept for the last network and the tables, and for each one's error."""
 
 
 @command
@@ -292,7 +296,7 @@ def _summary(comparisons: Sequence[Comparison], result: dict[str, Any], fresh: b
     if fresh:
         lines.append(f"{result['coverage']:.0%} of them within the {CONFIDENCE:.0%} interval")
     if result["unreliable"]:
-        lines.append(f"! {result['unreliable']} unreliable: their runs disagree; not counted")
+        lines.append(f"! {result['unreliable']} unreliable: the machine was busy; not counted")
     return "\n".join(lines)
 
 
@@ -378,9 +382,10 @@ def _fit(options: argparse.Namespace) -> None:
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:
     """Times networks until the budget is spent, going on where an earlier run stopped."""
     from ..model.machine import cores
-    from .measure import Bench, extend, jobs, open_journal, profile_of
+    from .measure import Bench, extend, open_journal, profile_of
+    from .plan import jobs
 
-    deadline = monotonic() + options.budget
+    deadline = monotonic() + options.budget - RESERVE_S
     threads = options.threads or cores()
     journal_path = path.with_name(f"{path.stem}.timings.json")
     journal = open_journal(journal_path, options.runtime, threads, options.seed)
@@ -402,7 +407,7 @@ def _until(deadline: float, items: Iterator[Job], timed: int) -> Iterator[Job]:
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("timing networks", total=deadline - started)
         for count, item in enumerate(items, timed + 1):
-            if monotonic() >= deadline:
+            if monotonic() + count * FITTING_S >= deadline:
                 return
             text = f"timing network {count}: {item.arch.label()}"
             bar.update(task, completed=monotonic() - started, description=text)
@@ -412,7 +417,7 @@ def _until(deadline: float, items: Iterator[Job], timed: int) -> Iterator[Job]:
 def _measure(options: argparse.Namespace) -> None:
     from ..model.machine import cores
     from .timed import BOUNDARY, REFERENCE_TOLD, Clock, given
-    from .timing import MAX_SPREAD
+    from .timing import MAX_ERROR
 
     threads = options.threads or cores()
     models = [given(path, options.resolution, options.stages) for path in options.models]
@@ -443,16 +448,16 @@ def _measure(options: argparse.Namespace) -> None:
             row.precision,
             f"{timing.median_ms:.2f}",
             f"{timing.p95_ms:.2f}",
-            f"{timing.spread:.1%}" + ("" if timing.reliable else " !"),
+            f"{timing.spread:.1%}",
             f"{1000 / timing.median_ms:.1f}",
             str(timing.runs),
-            f"{timing.ratio:.3f}",
+            f"{timing.ratio:.3f} ±{timing.error:.1%}" + ("" if timing.reliable else " !"),
         )
     _print(table)
     notes = [clock.told(), BOUNDARY, f"reference: {REFERENCE_TOLD.format(clock.reference)}"]
     if not all(row.timing.reliable for row in rows):
         notes.append(
-            f"! unreliable: a spread above {MAX_SPREAD:.0%} in every attempt; "
+            f"! unreliable: the machine was busy, or the ratio is not known to {MAX_ERROR:.0%}; "
             "close what else runs on this machine and measure again"
         )
     _print("")

@@ -1,12 +1,11 @@
-"""Teaching rts2 the machine at hand: which networks to time, timing them, and the profile of it."""
+"""Teaching rts2 the machine at hand: timing networks, and the profile that comes of it."""
 
 from __future__ import annotations
 
 import random
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import product
+from collections.abc import Sequence
+from math import exp, log
 from pathlib import Path
 from shutil import rmtree
 from statistics import median
@@ -15,12 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, UNTRAINED, Arch, Precision
+from ..model.arch import UNTRAINED, Arch, Precision
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
-from .calibrate import FORMS, calibrated
+from .calibrate import FORMS, fit
+from .heldout import hold_outs
 from .here import this_machine
+from .partfit import Harvest, damping, fit_parts, left_out
 from .parts import per_part
+from .plan import Candidate, Job, random_candidate
 from .profile import (
     Calibration,
     Fact,
@@ -32,28 +34,26 @@ from .profile import (
     Runtime,
     RuntimeSupport,
 )
-from .timing import Timing, measure
+from .timing import Reference, Timing, measure
 
 if TYPE_CHECKING:
     from .runtimes import Session
 
-RESOLUTIONS: tuple[Resolution, ...] = ((1242, 375), (640, 192))
-"""KITTI's, and about a quarter of its pixels: between them a latency is interpolated."""
-
 REFERENCE: tuple[Arch, Resolution] = (Arch(c=4, stages=2), (640, 192))
 """What is timed in between, to see the machine drift."""
 
-VARIANTS = ((False, False), (True, False), (True, True))
-"""The semantic branch and the refinement, in each variant."""
-
-Candidate = tuple[Arch, Resolution]
-
-
-PROFILED_RUNS = 4
+PROFILED_RUNS = 5
 """Runs whose nodes are timed, on top of those that time the whole network."""
 
-ATTEMPTS = 2
-"""How often a fit times a network whose runs disagree: another network tells as much."""
+FIT_ERROR, FIT_PATIENCE = 0.02, 3.0
+"""What a fit strives for, and for how long: another network tells more than one that is timed
+better."""
+
+ASKED, ASKED_SEED = 200, 7
+"""Random networks of the space whose usual error is told, and which ones."""
+
+WORTHLESS = 0.1
+"""The standard error above which a timing tells a fit nothing."""
 
 NEEDED = 24
 """Networks of one precision that tables can be made of."""
@@ -71,6 +71,8 @@ class Sample(BaseModel):
     reference_ms: Annotated[float, Field(gt=0)]
     ratio: Annotated[float, Field(gt=0)]
     """The latency over the reference's, run by run: drift cancels."""
+    error: Annotated[float, Field(ge=0)]
+    """The relative standard error of the ratio."""
     reliable: bool
     parts_ms: dict[str, Annotated[float, Field(ge=0)]]
     """What of the latency each part took."""
@@ -81,20 +83,11 @@ class Journal(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
-    schema_: Literal["rts2.timings/2"] = Field(default="rts2.timings/2", alias="schema")
+    schema_: Literal["rts2.timings/3"] = Field(default="rts2.timings/3", alias="schema")
     machine: Machine
     runtime: Runtime
     seed: int
     samples: tuple[Sample, ...] = ()
-
-
-@dataclass(frozen=True)
-class Job:
-    """One network to time."""
-
-    arch: Arch
-    resolution: Resolution
-    precision: Precision
 
 
 class Bench:
@@ -108,17 +101,17 @@ class Bench:
         self._folder = Path(mkdtemp(prefix="rts2."))
         weakref.finalize(self, rmtree, self._folder, ignore_errors=True)
         reference = self._exported(*REFERENCE, "reference")
-        self._reference = open_session("onnxruntime", reference, "fp32", threads)
+        self._reference = Reference(open_session("onnxruntime", reference, "fp32", threads).run)
         self._last: tuple[Arch, Resolution] | None = None
 
     def time(self, job: Job) -> Timing:
-        """One network, as a whole."""
-        return measure(self._opened(self._graph(job), job.precision).run, self._reference.run)
+        """One network as a whole, as carefully as can be."""
+        return measure(self._opened(self._graph(job), job.precision).run, self._reference)
 
     def harvest(self, job: Job) -> Sample:
         """One network as a whole, and node by node."""
         session = self._opened(self._graph(job), job.precision)
-        timing = measure(session.run, self._reference.run, ATTEMPTS)
+        timing = measure(session.run, self._reference, FIT_ERROR, FIT_PATIENCE)
         nodes = session.node_times_ms(PROFILED_RUNS)
         return Sample(
             arch=job.arch,
@@ -127,6 +120,7 @@ class Bench:
             latency_ms=timing.median_ms,
             reference_ms=timing.reference_ms,
             ratio=timing.ratio,
+            error=timing.error,
             reliable=timing.reliable,
             parts_ms=per_part(nodes, job.arch, timing.median_ms),
         )
@@ -150,87 +144,6 @@ class Bench:
         from .runtimes import open_session
 
         return open_session(self.runtime, path, precision, self.threads)
-
-
-def random_candidate(chance: random.Random) -> Candidate:
-    """A network and a resolution drawn from the whole space."""
-    stages = chance.choice((1, 2, 3))
-    variant = chance.choice(VARIANTS)
-    c = chance.choice(SPACE_C)
-    return _arch(lambda _, values: chance.choice(values), c, stages, variant), chance.choice(
-        RESOLUTIONS
-    )
-
-
-class Deck:
-    """Values in random order, each of them once before any comes again."""
-
-    def __init__(self, chance: random.Random) -> None:
-        self._chance = chance
-        self._left: dict[str, list[int]] = {}
-
-    def __call__(self, name: str, values: Sequence[int]) -> int:
-        """The next of `values`, which `name` stands for."""
-        left = self._left.setdefault(name, [])
-        if not left:
-            left += self._chance.sample(values, len(values))
-        return left.pop()
-
-
-def _arch(
-    pick: Callable[[str, Sequence[int]], int], c: int, stages: int, variant: tuple[bool, bool]
-) -> Arch:
-    semantic, refinement = variant
-    return Arch(
-        c=c,
-        stages=stages,
-        d_max=pick("d_max", SPACE_D_MAX),
-        conv3d=tuple(
-            pick(f"width {stage}", values) for stage, values in enumerate(SPACE_CONV3D[:stages])
-        ),
-        semantic=semantic,
-        refinement=refinement,
-    )
-
-
-def jobs(seed: int, precisions: tuple[Precision, ...]) -> Iterator[Job]:
-    """What to time, the most telling first, without end.
-
-    First every part at every c and both resolutions, within whole networks in random order; then
-    rounds of networks of all stage counts and variants in which every c comes once more. Planes
-    and widths go round in the same way, for each resolution.
-    """
-    chance = random.Random(seed)
-    decks = {resolution: Deck(chance) for resolution in RESOLUTIONS}
-    for arch, resolution in _first(chance, decks):
-        yield from (Job(arch, resolution, precision) for precision in precisions)
-    while True:
-        for arch, resolution in _round(chance, decks):
-            yield from (Job(arch, resolution, precision) for precision in precisions)
-
-
-def _first(chance: random.Random, decks: dict[Resolution, Deck]) -> list[Candidate]:
-    """Whole networks of every c, and the heads of all the others, in random order.
-
-    The corners of the space are among the first: what lies between them is interpolated.
-    """
-    whole = [
-        (_arch(decks[resolution], c, 3, (True, True)), resolution)
-        for c, resolution in product(chance.sample(SPACE_C, len(SPACE_C)), RESOLUTIONS)
-    ]
-    heads = [
-        (_arch(decks[resolution], chance.choice(SPACE_C), stages, variant), resolution)
-        for stages, variant, resolution in product((1, 2, 3), VARIANTS[:2], RESOLUTIONS)
-    ]
-    ends = [known for known in whole if known[0].c in (SPACE_C[0], SPACE_C[-1])]
-    return [*heads, *ends, *(known for known in whole if known not in ends)]
-
-
-def _round(chance: random.Random, decks: dict[Resolution, Deck]) -> Iterator[Candidate]:
-    for c in chance.sample(SPACE_C, len(SPACE_C)):
-        resolution = chance.choice(RESOLUTIONS)
-        stages, variant = chance.choice((1, 2, 3)), chance.choice(VARIANTS)
-        yield _arch(decks[resolution], c, stages, variant), resolution
 
 
 def open_journal(path: Path, runtime: Runtime, threads: int, seed: int) -> Journal:
@@ -261,24 +174,32 @@ def extend(journal: Journal, path: Path, sample: Sample) -> Journal:
 def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
     """The profile of this machine: `template`'s facts, the journal's timings, tables of parts.
 
-    A timing is its ratio to the reference times the reference's median over the whole session, so
-    that a drift of the machine cancels. Timings that are not reliable are left out.
+    A timing is its ratio to the reference times what the reference usually took. Timings that are
+    not reliable weigh less in the tables, and are neither points of the profile nor in its errors.
 
-    Raises `Rts2Error` where too few are left.
+    Raises `Rts2Error` where too few are reliable.
     """
-    if not journal.samples:
+    known = [sample for sample in journal.samples if sample.reliable]
+    if not known:
         raise _too_few(0)
-    usual = median(sample.reference_ms for sample in journal.samples)
+    usual = median(sample.reference_ms for sample in known)
     machine = journal.machine
     title = titled(journal.runtime)
     source = f"{title} on {machine.processor}, {machine.date}"
-    known = [sample for sample in journal.samples if sample.reliable]
     precisions = tuple(dict.fromkeys(sample.precision for sample in journal.samples))
-    points = tuple(_point(sample, journal.runtime, usual, source) for sample in known)
     facts = (
         Fact(name="processor", value=machine.processor, source="the operating system"),
         Fact(name="threads", value=str(machine.threads), source="rts2-profile"),
     )
+    fitted = {
+        precision: _Fitted(
+            [sample for sample in journal.samples if sample.precision == precision],
+            journal.runtime,
+            usual,
+            source,
+        )
+        for precision in precisions
+    }
     return template.model_copy(
         update={
             "name": name,
@@ -286,16 +207,9 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
             "hardware": facts,
             "precisions": _precisions(template, precisions, title),
             "runtimes": _runtimes(template, journal),
-            "calibrations": tuple(
-                _calibrated(
-                    [point for point in points if point.precision == precision],
-                    [sample for sample in journal.samples if sample.precision == precision],
-                    source,
-                )
-                for precision in precisions
-            ),
+            "calibrations": tuple(known.calibration() for known in fitted.values()),
             "derivations": (),
-            "points": points,
+            "points": tuple(point for known in fitted.values() for point in known.points),
             "machine": machine.model_copy(update={"reference_ms": usual}),
         }
     )
@@ -323,29 +237,76 @@ def _runtimes(template: Profile, journal: Journal) -> tuple[RuntimeSupport, ...]
     return (*template.runtimes, timed)
 
 
-def _point(sample: Sample, runtime: Runtime, usual_ms: float, source: str) -> Point:
-    latency = sample.ratio * usual_ms
-    scale = latency / sample.latency_ms
+class _Fitted:
+    """What was timed in one precision: points, and tables of them.
+
+    Raises `Rts2Error` where too few timings are reliable.
+    """
+
+    def __init__(
+        self, samples: Sequence[Sample], runtime: Runtime, usual_ms: float, source: str
+    ) -> None:
+        self._worthless = sum(sample.error > WORTHLESS for sample in samples)
+        samples = [sample for sample in samples if sample.error <= WORTHLESS]
+        self._reliable = [index for index, sample in enumerate(samples) if sample.reliable]
+        if len(self._reliable) < NEEDED:
+            raise _too_few(len(self._reliable))
+        self._source = source
+        seen = [_harvest(sample, usual_ms) for sample in samples]
+        power = damping(seen)
+        self._harvests = [_undrifted(harvest, power) for harvest in seen]
+        self.points = tuple(
+            _point(samples[index], self._harvests[index], runtime, source)
+            for index in self._reliable
+        )
+
+    def calibration(self) -> Calibration:
+        """Tables from everything, the errors of what is reliable."""
+        busy = len(self._harvests) - len(self.points)
+        told = f", {busy} more of a busy machine weigh less" if busy else ""
+        told += f", {self._worthless} more were worth nothing" if self._worthless else ""
+        first = self.points[0]
+        return Calibration(
+            runtime=first.runtime,
+            precision=first.precision,
+            model=fit_parts(self._harvests),
+            residuals=tuple(map(float, left_out(self._harvests, self._reliable, _asked()))),
+            source=f"times by node of {len(self.points)} whole networks{told}; {self._source}",
+            held_out=hold_outs(self.points, lambda others: fit(others, FORMS["parts"])),
+        )
+
+
+def _asked() -> list[Candidate]:
+    """What a search asks about, for the errors that it should expect."""
+    chance = random.Random(ASKED_SEED)
+    return [random_candidate(chance) for _ in range(ASKED)]
+
+
+def _harvest(sample: Sample, usual_ms: float) -> Harvest:
+    scale = sample.ratio * usual_ms / sample.latency_ms
+    parts_ms = {part: ms * scale for part, ms in sample.parts_ms.items()}
+    drift = 0.0 if sample.reliable else log(sample.reference_ms / usual_ms)
+    return Harvest(sample.arch, sample.resolution, parts_ms, sample.error, drift)
+
+
+def _undrifted(harvest: Harvest, power: float) -> Harvest:
+    """What it would have taken beside a reference at its usual speed."""
+    scale = exp(-power * harvest.drift)
+    parts_ms = {part: ms * scale for part, ms in harvest.ms.items()}
+    return harvest._replace(ms=parts_ms, drift=0.0)
+
+
+def _point(sample: Sample, harvest: Harvest, runtime: Runtime, source: str) -> Point:
     return Point(
         arch=sample.arch,
         runtime=runtime,
         precision=sample.precision,
         resolution=sample.resolution,
-        fps=1000 / latency,
+        fps=1000 / sum(harvest.ms.values()),
         evidence="measured",
         source=source,
-        parts_ms={part: float(f"{ms * scale:.6g}") for part, ms in sample.parts_ms.items()},
+        parts_ms={part: float(f"{ms:.6g}") for part, ms in harvest.ms.items()},
     )
-
-
-def _calibrated(points: Sequence[Point], timed: Sequence[Sample], source: str) -> Calibration:
-    """Tables from the reliable ones of all that was timed in a precision."""
-    if len(points) < NEEDED:
-        raise _too_few(len(points))
-    left_out = len(timed) - len(points)
-    told = f", {left_out} more were unreliable" if left_out else ""
-    told = f"times by node of {len(points)} whole networks{told}; {source}"
-    return calibrated(points, FORMS["parts"], told)
 
 
 def _too_few(count: int) -> Rts2Error:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from itertools import chain, product
 from math import prod
 from typing import Annotated, Literal, NamedTuple
 
@@ -21,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..model.arch import FACTORS, SPACE_C, SPACE_CONV3D, SPACE_D_MAX, STRIDES, Arch
 from ..model.errors import Rts2Error
-from ..model.ops import Op, ops
+from ..model.ops import Op
 
 Floats = NDArray[np.float64]
 Milliseconds = Annotated[float, Field(gt=0, le=1e6)]
@@ -225,100 +224,3 @@ def _scaled(known: Sequence[int], costs: Floats, pixels: int) -> float:
     share = (pixels - low) / (high - low)
     linear = costs[upper - 1] + share * (costs[upper] - costs[upper - 1])
     return float(max(linear, costs[0] * min(pixels / known[0], 1.0)))
-
-
-class Harvest(NamedTuple):
-    """One timed network: what each of its parts took, in milliseconds."""
-
-    arch: Arch
-    resolution: tuple[int, int]
-    ms: Mapping[str, float]
-
-
-def fit_parts(harvests: Sequence[Harvest]) -> PartModel:
-    """The tables of every part from networks that were timed part by part.
-
-    A value of the first axis that was timed keeps what was timed, over a smooth base that says
-    how the cost goes along the other axis; values between are interpolated.
-
-    Raises:
-        Rts2Error: a part was not timed at one of the sizes.
-    """
-    return _fit([_observed(harvest) for harvest in harvests])
-
-
-def left_out(harvests: Sequence[Harvest]) -> Floats:
-    """ln(true / predicted) of each network, predicted from tables without it."""
-    seen = [_observed(harvest) for harvest in harvests]
-    found = []
-    for index, own in enumerate(seen):
-        predicted = _fit([*seen[:index], *seen[index + 1 :]]).total_ms(part for part, _ in own)
-        found.append(np.log(sum(ms for _, ms in own) / predicted))
-    return np.array(found)
-
-
-Observed = list[tuple[Part, float]]
-
-ROUNDS = 4
-"""How often base and corrections are fitted in turn: a base that need not follow a staircase along
-the first axis tells better how the cost goes along the other one."""
-
-
-def _observed(harvest: Harvest) -> Observed:
-    steps = ops(harvest.arch, harvest.resolution)
-    return [(part, harvest.ms[part.name]) for part in parts(steps)]
-
-
-def _fit(networks: Sequence[Observed]) -> PartModel:
-    seen: dict[tuple[str, int], Observed] = {}
-    for part, ms in chain.from_iterable(networks):
-        seen.setdefault((part.name, part.pixels), []).append((part, ms))
-    pixels = sorted({size for _, size in seen})
-    tables = {
-        name: PartTable(
-            axes=axis_values(name),
-            ms=tuple(_row(name, seen.get((name, size), []), size) for size in pixels),
-        )
-        for name in AXES
-    }
-    return PartModel(pixels=tuple(pixels), tables=tables)
-
-
-def _row(name: str, seen: Observed, pixels: int) -> tuple[float, ...]:
-    """One part's cost at every place of its axes, at one size."""
-    if not seen:
-        raise Rts2Error(f"no network with {name} was timed at {pixels} pixels; time more")
-    places = np.array([part.at for part, _ in seen], float)
-    truth = np.array([ms for _, ms in seen])
-    first, member = np.unique(places[:, 0], return_inverse=True)
-    kept = np.zeros(len(first))
-    for _ in range(ROUNDS):
-        base = _Base(places, truth / np.exp(kept[member]))
-        told = np.log(truth / base(places))
-        kept = np.bincount(member, told) / np.bincount(member)
-    grid = np.array(list(product(*axis_values(name))), float)
-    cost = base(grid) * np.exp(np.interp(grid[:, 0], first, kept))
-    return tuple(float(f"{ms:.6g}") for ms in cost)
-
-
-class _Base:
-    """A smooth cost over a part's axes: non-negative least squares on relative error."""
-
-    def __init__(self, places: Floats, truth: Floats) -> None:
-        from scipy.optimize import nnls
-
-        columns = self._columns(places) / truth[:, None]
-        self._scale = columns.max(0)
-        self._values, _ = nnls(columns / self._scale, np.ones(len(truth)))
-
-    def __call__(self, places: Floats) -> Floats:
-        return np.asarray(self._columns(places) / self._scale @ self._values)
-
-    @staticmethod
-    def _columns(places: Floats) -> Floats:
-        """1, x, x² of the first axis, each times 1 and the second axis where there is one."""
-        first = places[:, 0]
-        powers = np.stack([np.ones_like(first), first + 1e-9, first**2 + 1e-9], 1)
-        if places.shape[1] == 1:
-            return powers
-        return np.concatenate([powers, powers * places[:, 1:2]], 1)

@@ -17,7 +17,7 @@ from . import measure as references
 from . import timing
 from .here import this_machine
 from .profile import Machine
-from .runtimes import Session, Sized, open_session, precisions_of, usable
+from .runtimes import Sized, open_session, precisions_of, usable
 
 BOUNDARY: Final = "batch 1, the network alone: padded input in, full-resolution output out"
 
@@ -71,6 +71,7 @@ class Row:
             "latency_ms": self.timing.median_ms,
             "p95_ms": self.timing.p95_ms,
             "spread": self.timing.spread,
+            "error": self.timing.error,
             "fps": 1000 / self.timing.median_ms,
             "reference_ms": self.timing.reference_ms,
             "ratio": self.timing.ratio,
@@ -109,7 +110,7 @@ class Clock:
     def time(self, subject: Given, precision: Precision) -> Row:
         """One model; raises as `open_session` does."""
         session = open_session(self.runtime, subject.model, precision, self.threads)
-        found = timing.measure(session.run, self._reference.run)
+        found = timing.measure(session.run, self._reference)
         return Row(
             subject.name,
             precision,
@@ -130,11 +131,12 @@ class Clock:
         return f"{self.known.title} ({listed}), {counted}, {device}"
 
     @cached_property
-    def _reference(self) -> Session:
+    def _reference(self) -> timing.Reference:
         from ..model.checkpoint import build
 
         arch, resolution = references.REFERENCE
-        return open_session(self.beside, Sized(build(arch), resolution), "fp32", self.threads)
+        sized = Sized(build(arch), resolution)
+        return timing.Reference(open_session(self.beside, sized, "fp32", self.threads).run)
 
 
 def given(path: Path, resolution: tuple[int, int] | None, stages: int | None) -> Given:

@@ -1,14 +1,18 @@
 """Timing on a machine that others use too: warm, repeated, and beside a reference.
 
 Every run stands between two runs of a reference network, and what counts is the ratio of the run to
-their mean: a drift of the machine shows in both and cancels, pair by pair.
+their mean, over the runs in which the machine was quiet: those whose reference, before and after,
+ran about as fast as it ever does. A busy machine slows a network of many small kernels more than
+one of few large ones, so that no ratio cancels what others take; waiting until they stop does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from math import hypot, inf, sqrt
 from statistics import median
 from time import perf_counter
 from typing import Final
@@ -19,79 +23,170 @@ WARM_UP_S = 0.2
 MIN_RUNS = 10
 MIN_SECONDS = 0.5
 
-ATTEMPTS: Final = 3
-"""How often a measurement is taken at most, each one twice as long as the one before."""
+OWN_RUNS: Final = 100
+OWN_SECONDS = 1.0
+"""How long a reference runs before its own speed is told, whichever is shorter."""
 
-MAX_SPREAD: Final = 0.1
-"""The widest spread that a measurement is trusted with. The median of n runs has a standard error
-of 0.93 × (interquartile range) / √n, so at this spread ten runs tell the ratio within ±5% at 90%;
-where the spread is wider, the machine had two speeds, and no median says which was its own."""
+OWN_PERCENTILE: Final = 10
+QUIET: Final = 1.12
+"""The machine is quiet while the reference takes at most this many times what it takes at its own
+speed, the fastest tenth of its runs so far."""
+
+MIN_QUIET: Final = 5
+"""Quiet runs that a ratio is told from."""
+
+BUSY_ERROR: Final = 0.05
+"""What a ratio is off by on a busy machine, in addition to its standard error: ten networks of 8 to
+250 ms, each timed in seven minutes between which the reference drifted by up to 70%, deviated from
+their own median by 5%; in the quiet runs alone by 1.5%."""
+
+MAX_ERROR: Final = 0.03
+"""The largest standard error that a timing is trusted with."""
+
+CAREFUL: Final = 0.012
+"""The standard error that a timing strives for."""
+
+PATIENCE: Final = 8
+"""How many times as long as its least a timing may take, to become as good as it strives for."""
+
+
+class Reference:
+    """A network beside which others are timed, and its own speed."""
+
+    def __init__(self, run: Callable[[], None]) -> None:
+        self._run = run
+        self._times_ms: list[float] = []
+
+    def warm_up(self) -> None:
+        """Runs before the first that counts; in the beginning enough to tell the own speed from."""
+        if self._times_ms:
+            self._run()
+            return
+        _warm_up(self._run)
+        started = perf_counter()
+        while perf_counter() - started < OWN_SECONDS and len(self._times_ms) < OWN_RUNS:
+            self.time_ms()
+
+    def time_ms(self) -> float:
+        """One run."""
+        self._times_ms.append(_once_ms(self._run))
+        return self._times_ms[-1]
+
+    @property
+    def own_ms(self) -> float:
+        """What it takes while nothing else takes the machine from it; infinite before any run."""
+        return float(np.percentile(self._times_ms, OWN_PERCENTILE)) if self._times_ms else inf
 
 
 @dataclass(frozen=True)
 class Timing:
     """How long one pair takes: batch 1, the network alone."""
 
-    median_ms: float
-    p95_ms: float
-    runs: int
-    reference_ms: float
-    """The median of the reference network, timed in between the runs."""
-    ratios: tuple[float, ...] = ()
-    """Each run over the mean of the reference's runs before and after it."""
+    times_ms: tuple[float, ...]
+    references_ms: tuple[float, ...]
+    """The reference before the first run, between the runs, and after the last."""
+    own_ms: float
+    """What the reference takes on this machine while it is quiet."""
+
+    @property
+    def median_ms(self) -> float:
+        return median(self.times_ms)
+
+    @property
+    def p95_ms(self) -> float:
+        return float(np.percentile(self.times_ms, 95))
+
+    @property
+    def runs(self) -> int:
+        return len(self.times_ms)
+
+    @cached_property
+    def quiet(self) -> bool:
+        """Whether the machine was quiet in enough of the runs."""
+        return sum(self._quiet) >= MIN_QUIET
+
+    @cached_property
+    def ratios(self) -> tuple[float, ...]:
+        """Each run that counts over the mean of the reference's runs before and after it."""
+        times = np.array(self.times_ms)[self._counting]
+        return tuple(float(ratio) for ratio in times / self._beside[self._counting])
 
     @property
     def ratio(self) -> float:
-        """The median of the runs' ratios to the reference, in which drift cancels."""
-        return median(self.ratios) if self.ratios else self.median_ms / self.reference_ms
+        """The median of the ratios."""
+        return median(self.ratios)
+
+    @property
+    def reference_ms(self) -> float:
+        """The median of the reference beside the runs that count."""
+        return float(np.median(self._beside[self._counting]))
 
     @property
     def spread(self) -> float:
         """The interquartile range of the ratios over their median: no outlier moves it."""
-        if not self.ratios:
-            return 0.0
         low, high = np.percentile(self.ratios, (25, 75))
         return float(high - low) / self.ratio
 
     @property
+    def error(self) -> float:
+        """The relative standard error of the ratio: that of a median, and what is busy adds to."""
+        told = 0.93 * self.spread / sqrt(len(self.ratios))
+        return told if self.quiet else hypot(told, BUSY_ERROR)
+
+    @property
     def reliable(self) -> bool:
-        """Whether the runs agree (see `MAX_SPREAD`)."""
-        return self.spread <= MAX_SPREAD
+        """Whether the runs agree, on a quiet machine (see `MAX_ERROR`)."""
+        return self.error <= MAX_ERROR
+
+    @cached_property
+    def _beside(self) -> np.ndarray:
+        return np.array([(before + after) / 2 for before, after in pairwise(self.references_ms)])
+
+    @cached_property
+    def _quiet(self) -> tuple[bool, ...]:
+        most = QUIET * self.own_ms
+        return tuple(max(around) <= most for around in pairwise(self.references_ms))
+
+    @property
+    def _counting(self) -> np.ndarray:
+        """The quiet runs, or else all of them."""
+        return np.array(self._quiet) if self.quiet else np.ones(self.runs, bool)
 
 
 def measure(
-    run: Callable[[], None], reference: Callable[[], None], attempts: int = ATTEMPTS
+    run: Callable[[], None],
+    reference: Reference,
+    error: float = CAREFUL,
+    patience: float = PATIENCE,
 ) -> Timing:
-    """Times `run` with `reference` in between; a measurement with too wide a spread is repeated.
+    """Times `run` with `reference` in between, until the standard error is as small as `error`.
 
-    Each of the `attempts` takes twice as long as the one before. What is returned is one of them,
-    never a mean: the first that is reliable, or else the one of the narrowest spread, which says
-    of itself that it is not. A GPU's work must be done when `run` returns.
+    At least `MIN_RUNS` runs and `MIN_SECONDS`, at most `patience` times as long. What is returned
+    tells by itself whether it is reliable. A GPU's work must be done when `run` returns.
     """
     _warm_up(run)
-    _warm_up(reference)
-    found: list[Timing] = []
-    while not found or (len(found) < attempts and not found[-1].reliable):
-        found.append(_measured(run, reference, 2 ** len(found)))
-    return min(found, key=lambda timing: timing.spread)
-
-
-def _measured(run: Callable[[], None], reference: Callable[[], None], length: int) -> Timing:
-    """One measurement, `length` times as long as the shortest."""
+    reference.warm_up()
     times: list[float] = []
-    references = [_once_ms(reference)]
+    references = [reference.time_ms()]
     started = perf_counter()
-    while len(times) < length * MIN_RUNS or perf_counter() - started < length * MIN_SECONDS:
+    least = inf
+    while True:
         times.append(_once_ms(run))
-        references.append(_once_ms(reference))
-    around = [(before + after) / 2 for before, after in pairwise(references)]
-    ratios = tuple(time / beside for time, beside in zip(times, around, strict=True))
-    p95_ms = float(np.percentile(times, 95))
-    return Timing(median(times), p95_ms, len(times), median(references), ratios)
+        references.append(reference.time_ms())
+        spent = perf_counter() - started
+        if len(times) < MIN_RUNS or spent < MIN_SECONDS:
+            continue
+        least = min(least, spent)
+        found = Timing(tuple(times), tuple(references), reference.own_ms)
+        if found.error <= error or spent >= patience * least:
+            return found
 
 
 def _warm_up(run: Callable[[], None]) -> None:
+    """At least two runs: what a network takes from the machine, it takes in the first."""
     started = perf_counter()
+    run()
+    run()
     while perf_counter() - started < WARM_UP_S:
         run()
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from ...model.arch import UNTRAINED, Precision
 from ...model.errors import UsageError
 from ...model.files import filling_folder, write_bytes, write_json
-from ..measure import Candidate
 from ..opset import refuse_operators
+from ..plan import Candidate
 from ..profile import Profile, RuntimeSupport
 from ..trtexec import PATH, PRECISIONS, build_flags
 from .manifest import MANIFEST, KitNetwork, Manifest

@@ -9,7 +9,7 @@ import numpy as np
 from ...model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, Arch
 from ...model.ops import ops
 from ..latency import Floats, LatencyModel, Steps
-from ..measure import RESOLUTIONS, VARIANTS, Candidate, random_candidate
+from ..plan import RESOLUTIONS, VARIANTS, Candidate, random_candidate
 from .fewshot import COMMON, NOISE, shares
 
 NETWORKS = 12

@@ -27,7 +27,7 @@ class Session(Protocol):
         """One pair through the network; returns when the result is there."""
 
     def node_times_ms(self, runs: int) -> dict[str, float]:
-        """What each node of the ONNX file takes: medians over the runs, by the node's name.
+        """What each node of the ONNX file takes, at its fastest run, by the node's name.
 
         Their sum is that of all that the runtime did. Raises `Rts2Error` where a runtime cannot
         tell.

@@ -11,16 +11,9 @@ from rts2.model.arch import Arch, Precision
 from rts2.model.ops import ops, padded
 from rts2.profiles.here import this_machine
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.measure import (
-    RESOLUTIONS,
-    Bench,
-    Job,
-    Journal,
-    Sample,
-    jobs,
-    profile_of,
-)
+from rts2.profiles.measure import Bench, Journal, Sample, profile_of
 from rts2.profiles.parts import AXES, PartModel, PartTable, axis_values, parts
+from rts2.profiles.plan import RESOLUTIONS, Job, jobs
 from rts2.profiles.profile import Profile, Runtime, load
 from rts2.profiles.timing import Timing
 
@@ -58,7 +51,8 @@ TRUTH = _truth()
 
 class Planted(Bench):
     """In the place of a bench: takes what `TRUTH` says, times `factor`, on a day when everything,
-    the reference too, takes `drift` times as long. Its runs spread by `spread`.
+    the reference too, takes `drift` times as long. Its runs spread by `spread`; while it is `busy`
+    the reference never runs at its own speed.
     """
 
     truth = TRUTH
@@ -68,6 +62,7 @@ class Planted(Bench):
         self.precisions: tuple[Precision, ...] = ("fp32",)
         self.factor = self.drift = 1.0
         self.spread = 0.0
+        self.busy = False
         self.timed: list[Job] = []
 
     def latency_ms(self, job: Job) -> float:
@@ -77,8 +72,9 @@ class Planted(Bench):
     def time(self, job: Job) -> Timing:
         self.timed.append(job)
         latency, reference = self.drift * self.latency_ms(job), self.drift * REFERENCE_MS
-        ratios = latency / reference * np.linspace(1 - self.spread, 1 + self.spread, 11)
-        return Timing(latency, 1.1 * latency, 11, reference, tuple(map(float, ratios)))
+        times = latency * np.linspace(1 - self.spread, 1 + self.spread, 11)
+        own = reference / (2 if self.busy else 1)
+        return Timing(tuple(map(float, times)), (reference,) * 12, own)
 
     def harvest(self, job: Job) -> Sample:
         timing = self.time(job)
@@ -91,6 +87,7 @@ class Planted(Bench):
             latency_ms=timing.median_ms,
             reference_ms=timing.reference_ms,
             ratio=timing.ratio,
+            error=timing.error,
             reliable=timing.reliable,
             parts_ms={part.name: scale * TRUTH.cost_ms(part) for part in found},
         )

@@ -13,7 +13,7 @@ from rts2.model.errors import Rts2Error
 from rts2.profiles.calibrate import fit, leave_one_out, recalibrated
 from rts2.profiles.check import Comparison, coverage, fresh, held_out, report
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.measure import Job, jobs
+from rts2.profiles.plan import Job, jobs
 from rts2.profiles.profile import Profile, load
 from rts2.search.space import Space
 

@@ -18,23 +18,13 @@ from rts2.model.ops import ops
 from rts2.profiles import measure, timing
 from rts2.profiles.here import this_machine
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.measure import (
-    NEEDED,
-    RESOLUTIONS,
-    Bench,
-    Job,
-    Journal,
-    extend,
-    jobs,
-    open_journal,
-    profile_of,
-    random_candidate,
-)
+from rts2.profiles.measure import NEEDED, Bench, Journal, extend, open_journal, profile_of
 from rts2.profiles.parts import PartModel, parts
+from rts2.profiles.plan import RESOLUTIONS, Job, jobs, random_candidate
 from rts2.profiles.profile import Profile, load
 from rts2.search.space import Space
 
-FIRST = 76
+FIRST = 64
 """Networks at the start of every plan: 12 heads, and each c at both sizes."""
 
 SMALL = Arch(c=1, stages=1, d_max=6, conv3d=(4,), semantic=False)
@@ -144,7 +134,7 @@ def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(
         assert Job(last.arch, last.resolution, last.precision) == job
         assert last.latency_ms == pytest.approx(bench.latency_ms(job))
         assert sum(last.parts_ms.values()) == pytest.approx(last.latency_ms)
-    assert json.loads(path.read_text())["schema"] == "rts2.timings/2"
+    assert json.loads(path.read_text())["schema"] == "rts2.timings/3"
 
 
 @pytest.fixture
@@ -208,7 +198,7 @@ def test_a_broken_journal_is_named_in_one_line(stored: Path, field: str, value: 
 
 
 def test_a_journal_of_before_is_refused_by_its_schema(stored: Path) -> None:
-    stored.write_text(json.dumps(json.loads(stored.read_text()) | {"schema": "rts2.timings/1"}))
+    stored.write_text(json.dumps(json.loads(stored.read_text()) | {"schema": "rts2.timings/2"}))
     with pytest.raises(Rts2Error, match=r"a journal of timings .*schema"):
         opened(stored)
 
@@ -248,7 +238,7 @@ def test_the_fit_of_planted_timings_predicts_networks_that_it_never_saw(planted:
     for _ in range(60):
         unseen = Job(*random_candidate(chance), "fp32")
         assert predict_ms(model, unseen.arch, unseen.resolution) == pytest.approx(
-            bench.latency_ms(unseen), rel=1e-4
+            bench.latency_ms(unseen), rel=1e-2
         )
 
 
@@ -289,8 +279,8 @@ def test_unreliable_timings_are_left_out(planted: Any) -> None:
     assert found.calibrations[0].model == expected.calibrations[0].model
     assert found.calibrations[0].residuals == expected.calibrations[0].residuals
     assert len(found.points) == 27
-    assert "27 whole networks, 3 more were unreliable" in found.calibrations[0].source
-    assert "unreliable" not in expected.calibrations[0].source
+    assert "27 whole networks, 3 more were worth nothing" in found.calibrations[0].source
+    assert "more" not in expected.calibrations[0].source
 
 
 def test_too_few_reliable_timings_name_the_remedy(planted: Any) -> None:
@@ -343,6 +333,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr(measure, "REFERENCE", (Arch(c=1, stages=1, d_max=6), (64, 64)))
     monkeypatch.setattr(timing, "WARM_UP_S", 0.01)
     monkeypatch.setattr(timing, "MIN_SECONDS", 0.01)
+    monkeypatch.setattr(timing, "OWN_SECONDS", 0.01)
     return Bench("onnxruntime", 1)
 
 

@@ -1,6 +1,7 @@
 """Tables of parts, held against machines whose costs are known exactly."""
 
 import random
+from itertools import product
 from math import ceil
 from pathlib import Path
 
@@ -15,20 +16,18 @@ from rts2.model.export import export
 from rts2.model.graph import load_graph
 from rts2.model.ops import ops
 from rts2.profiles.latency import Steps, latencies_ms, predict_ms
-from rts2.profiles.measure import RESOLUTIONS, jobs, random_candidate
+from rts2.profiles.partfit import Harvest, fit_parts, left_out
 from rts2.profiles.parts import (
     AXES,
-    Harvest,
     Part,
     PartModel,
     PartTable,
     axis_values,
-    fit_parts,
-    left_out,
     part_of,
     parts,
     per_part,
 )
+from rts2.profiles.plan import RESOLUTIONS, jobs, random_candidate
 from rts2.search.space import Parts, Space
 
 Candidate = tuple[Arch, tuple[int, int]]
@@ -145,8 +144,8 @@ def test_a_c_that_nobody_timed_lies_between_its_neighbours() -> None:
 def test_a_network_left_out_is_predicted_from_the_others_alone() -> None:
     """One network that took twice as long misses by ln 2, or more where others share its c."""
     known = harvested(140)
-    arch, resolution, ms = known[100]
-    known[100] = Harvest(arch, resolution, {part: 2 * value for part, value in ms.items()})
+    ms = known[100].ms
+    known[100] = known[100]._replace(ms={part: 2 * value for part, value in ms.items()})
     residuals = left_out(known)
     assert residuals[100] == pytest.approx(np.log(2), abs=0.1)
     assert np.median(np.abs(residuals)) < 0.01
@@ -194,11 +193,11 @@ def test_tables_of_another_shape_are_refused() -> None:
         PartModel(pixels=(2, 2), tables={})
 
 
-def test_the_plan_covers_every_c_at_both_sizes_first() -> None:
-    first = [job for job, _ in zip(jobs(3, ("fp32",)), range(76), strict=False)]
-    whole = {(j.arch.c, j.resolution) for j in first if j.arch.stages == 3 and j.arch.refinement}
-    assert whole == {(c, size) for c in SPACE_C for size in RESOLUTIONS}
-    assert {(j.arch.stages, j.arch.semantic) for j in first} == {
-        (stages, semantic) for stages in (1, 2, 3) for semantic in (False, True)
-    }
+def test_the_plan_covers_every_c_at_both_sizes_and_every_head_first() -> None:
+    first = [job for job, _ in zip(jobs(3, ("fp32",)), range(64), strict=False)]
+    assert {(j.arch.c, j.resolution) for j in first} == set(product(SPACE_C, RESOLUTIONS))
+    whole = [j.arch.c for j in first if j.arch.stages == 3 and j.arch.refinement]
+    assert set(whole) == set(SPACE_C)
+    heads = {(j.arch.stages, j.arch.semantic, j.resolution) for j in first[:16]}
+    assert heads == set(product((1, 2, 3), (False, True), RESOLUTIONS))
     assert axis_values("regularize.1") == ((2, 4, 6, 8, 12, 16), (5,))

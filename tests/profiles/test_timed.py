@@ -49,7 +49,9 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measure, "REFERENCE", (Arch(c=1, stages=1, d_max=6), (64, 64)))
     monkeypatch.setattr(timing, "WARM_UP_S", 0.01)
     monkeypatch.setattr(timing, "MIN_SECONDS", 0.01)
-    monkeypatch.setattr(timing, "MAX_SPREAD", 1e6)
+    monkeypatch.setattr(timing, "OWN_SECONDS", 0.01)
+    monkeypatch.setattr(timing, "CAREFUL", 1e6)
+    monkeypatch.setattr(timing, "MAX_ERROR", 1e6)
 
 
 @pytest.fixture
@@ -110,14 +112,14 @@ def test_the_table_says_it_too(run: Any, models: dict[str, Path]) -> None:
 def test_an_unreliable_timing_is_marked(
     run: Any, models: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wide = Timing(10.0, 20.0, 10, 5.0, (1.0, 1.0, 2.0, 3.0, 3.0))
-    monkeypatch.setattr(timing, "MAX_SPREAD", 0.1)
+    wide = Timing((5.0, 5.0, 10.0, 15.0, 15.0), (5.0,) * 6, 5.0)
+    monkeypatch.setattr(timing, "MAX_ERROR", 0.03)
     monkeypatch.setattr(timing, "measure", lambda *_: wide)
     asked = (models["graph"], "--threads", 1)
     code, out, _ = run(*asked)
     assert code == 0
-    assert "100.0% !" in out
-    assert "! unreliable: a spread above 10%" in out
+    assert "2.000 ±41.6% !" in out
+    assert "! unreliable: the machine was busy, or the ratio is not known to 3%" in out
     (row,) = json.loads(run(*asked, "--json")[1])["models"]
     assert (row["reliable"], row["spread"], row["ratio"]) == (False, 1.0, 2.0)
 

@@ -17,7 +17,7 @@ from rts2.profiles.kit.folder import write
 from rts2.profiles.kit.manifest import Manifest
 from rts2.profiles.kit.prior import prior
 from rts2.profiles.latency import LatencyModel, predict_ms
-from rts2.profiles.measure import VARIANTS, Candidate
+from rts2.profiles.plan import VARIANTS, Candidate
 from rts2.profiles.profile import load
 
 STANDIN = Path(__file__).with_name("standin.py")

@@ -11,7 +11,7 @@ from rts2.profiles.kit.fewshot import calibrated, leave_one_out, posterior, shar
 from rts2.profiles.kit.plan import networks
 from rts2.profiles.kit.prior import prior
 from rts2.profiles.latency import Floats, LatencyModel, Steps, latencies_ms, predict_ms
-from rts2.profiles.measure import Candidate, random_candidate
+from rts2.profiles.plan import Candidate, random_candidate
 from rts2.profiles.profile import Point, load
 
 KNOWN = prior(load("tx2"), "tensorrt", "fp32").model

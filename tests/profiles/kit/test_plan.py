@@ -13,7 +13,7 @@ from rts2.profiles.kit.fewshot import shares
 from rts2.profiles.kit.plan import corners, networks
 from rts2.profiles.kit.prior import prior
 from rts2.profiles.latency import LatencyModel, Steps
-from rts2.profiles.measure import RESOLUTIONS, Candidate, random_candidate
+from rts2.profiles.plan import RESOLUTIONS, Candidate, random_candidate
 from rts2.profiles.profile import load
 
 
