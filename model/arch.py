@@ -12,6 +12,8 @@ from .files import first_fault
 Family = Literal["rts2net", "anynet"]
 Branches = Literal["disparity", "disparity+semantic", "full"]
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
+Form = Literal["3d", "banded"]
+"""How a graph holds the 3D convs of a stage: as such, or as 2D convs with banded weights."""
 
 UNTRAINED = "untrained"
 """The origin of random weights."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from copy import deepcopy
 from importlib.metadata import version
 from itertools import pairwise
@@ -16,9 +17,10 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from .arch import STRIDES
+from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
+from .forms import formed, forms_run
 from .graph import GraphHeader, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
@@ -40,12 +42,18 @@ class Parity(NamedTuple):
 
 
 class Deployed(nn.Module):
-    """A network as a target runs it: the answer of the last stage alone, at full resolution."""
+    """A network as a target runs it: the answer of the last stage alone, at full resolution.
 
-    def __init__(self, network: Network, stages: int | None = None) -> None:
+    With `forms`, one for each stage of the network, it runs a copy that holds its 3D convs so.
+    """
+
+    def __init__(
+        self, network: Network, stages: int | None = None, forms: Sequence[Form] | None = None
+    ) -> None:
         super().__init__()
-        self.network = network
+        self.network = formed(network, forms) if forms else network
         self.arch = network.arch.up_to(stages)
+        self.forms = forms_run(forms, self.arch.stages)
         # AnyNet's maps come at full resolution.
         self.factor = STRIDES[self.arch.stages - 1] if self.arch.family == "rts2net" else 1
 
@@ -68,24 +76,29 @@ def export(
     origin: str,
     opset: int = OPSET,
     stages: int | None = None,
+    forms: Sequence[Form] | None = None,
 ) -> GraphHeader:
     """Writes the network as ONNX for one resolution (W, H), batch 1, all shapes static.
 
     Inputs `left` and `right` are (1, 3, H, W), normalised, at the padded size; outputs are
     `disparity` (1, H, W) float32 and, with a semantic branch, `semantic` (1, H, W) int32. Constants
-    are folded, the operators are ONNX's own, and equal arguments give equal bytes.
+    are folded, the operators are ONNX's own, and equal arguments give equal bytes. `forms` tells
+    for each stage of the network how its 3D convs are held (see `formed`): all 3d without it.
 
     Raises:
-        UsageError: the arch has fewer stages, or the opset is none of `OPSETS`.
+        UsageError: the arch has fewer stages, the opset is none of `OPSETS`, or the forms are not
+            for this network.
     """
     if opset not in OPSETS:
         raise UsageError(f"opset must be {OPSETS[0]} to {OPSETS[-1]}, not {opset}")
-    deployed = Deployed(deepcopy(network), stages).eval()  # the exporter plays with its modes
+    # A copy, as the exporter plays with its modes.
+    deployed = Deployed(deepcopy(network), stages, forms).eval()
     height, width = padded(resolution, deployed.arch.multiple)
     header = GraphHeader(
         arch=deployed.arch,
         resolution=resolution,
         size=(width, height),
+        forms=deployed.forms,
         origin=origin,
         rts2=version("rts2"),
     )

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import onnx
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
 
-from .arch import MEAN, STD, Arch, Precision
+from .arch import MEAN, STD, Arch, Form, Precision
 from .errors import Rts2Error
 from .files import existing_file, parse_json, write_bytes
 
@@ -28,12 +28,28 @@ class GraphHeader(BaseModel):
     size: tuple[int, int]
     """Width and height of its inputs: the resolution, padded."""
     precision: Precision = "fp32"
+    forms: tuple[Form, ...] | None = None
+    """One for each stage; None where all are 3d."""
     mean: tuple[float, float, float] = MEAN
     std: tuple[float, float, float] = STD
     origin: str
     """How the weights came to be, as the checkpoint has it."""
     rts2: str
     """The version of rts2 that wrote the file."""
+
+    @field_validator("forms")
+    @classmethod
+    def _one_a_stage(
+        cls, forms: tuple[Form, ...] | None, info: ValidationInfo
+    ) -> tuple[Form, ...] | None:
+        arch = info.data.get("arch")  # absent where it is wrong itself
+        if forms is None or arch is None:
+            return forms
+        if arch.family != "rts2net":
+            raise ValueError(f"the {arch.family} family has none")
+        if len(forms) != arch.stages:
+            raise ValueError(f"forms must be one per stage, {arch.stages} in all")
+        return forms
 
     @property
     def stages(self) -> int:
@@ -42,7 +58,8 @@ class GraphHeader(BaseModel):
 
 def save_graph(model: onnx.ModelProto, header: GraphHeader, path: Path) -> None:
     """Writes an ONNX model with our header, whole or not at all."""
-    onnx.helper.set_model_props(model, {HEADER: header.model_dump_json()})
+    # What is not set is not written: a file without forms is one that earlier versions read.
+    onnx.helper.set_model_props(model, {HEADER: header.model_dump_json(exclude_none=True)})
     write_bytes(path, model.SerializeToString(deterministic=True))
 
 
