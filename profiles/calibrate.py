@@ -94,7 +94,10 @@ def _harvests(points: Sequence[Point]) -> list[Harvest]:
             raise Rts2Error(
                 f"{point.arch.label()} was not timed part by part, which tables of parts need"
             )
-    return [Harvest(point.arch, point.resolution, point.parts_ms or {}) for point in points]
+    return [
+        Harvest(point.arch, point.resolution, point.parts_ms or {}, forms=point.forms)
+        for point in points
+    ]
 
 
 def _table(points: Sequence[Point]) -> tuple[Steps, Floats]:

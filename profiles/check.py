@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, log
 from typing import Any
 
@@ -12,7 +12,7 @@ from ..model.arch import Arch, Precision
 from ..model.errors import Rts2Error
 from .calibrate import summary
 from .conformal import half_width
-from .latency import predict_ms
+from .latency import fastest_forms, predict_ms
 from .measure import Bench
 from .plan import Job, random_candidate
 from .profile import Profile, Resolution, Runtime
@@ -106,10 +106,12 @@ def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[C
 
 
 def _compared(profile: Profile, bench: Bench, job: Job) -> Comparison:
-    """One network, timed now."""
+    """One network in its fastest form, timed now."""
+    known = profile.calibration(bench.runtime, job.precision)
+    forms = fastest_forms(known.model, job.arch, job.resolution)
+    job = replace(job, forms=forms)
     timing = bench.time(job)
     then = (profile.machine and profile.machine.reference_ms) or timing.reference_ms
-    known = profile.calibration(bench.runtime, job.precision)
     return Comparison(
         job.arch,
         job.precision,

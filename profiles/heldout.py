@@ -14,8 +14,8 @@ import numpy as np
 from ..model.arch import Arch
 from ..model.errors import Rts2Error
 from ..model.ops import ops
-from .latency import LatencyModel, Steps, latencies_ms
-from .parts import PartModel
+from .latency import Floats, LatencyModel, Steps, latencies_ms
+from .parts import PartModel, parts
 from .profile import HeldOut, HoldOut, Misses, Point
 
 Refit = Callable[[Sequence[Point]], LatencyModel | PartModel]
@@ -48,13 +48,21 @@ def _hold_out(points: Sequence[Point], group: Callable[[Arch], str], refit: Refi
 
 def _errors(left_out: Sequence[Point], others: Sequence[Point], refit: Refit) -> list[float]:
     """Relative errors of the frame rates; none where the others are too few to fit or to tell."""
-    steps = Steps.of([ops(point.arch, point.resolution) for point in left_out])
     true = np.array([point.latency_ms for point in left_out])
     try:
-        predicted = latencies_ms(refit(others), steps)
+        predicted = _predicted(refit(others), left_out)
     except Rts2Error:
         return []
     return [float(error) for error in np.abs(true / predicted - 1)]
+
+
+def _predicted(model: LatencyModel | PartModel, points: Sequence[Point]) -> Floats:
+    """Latencies of the points, in the forms that they were timed in."""
+    steps = [ops(point.arch, point.resolution) for point in points]
+    if isinstance(model, LatencyModel):
+        return latencies_ms(model, Steps.of(steps))
+    timed = zip(steps, points, strict=True)
+    return np.array([model.total_ms(parts(found, point.forms)) for found, point in timed])
 
 
 def _misses(errors: Sequence[float]) -> Misses:

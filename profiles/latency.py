@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from ..model.arch import Arch
+from ..model.arch import Arch, Form
 from ..model.errors import Rts2Error
 from ..model.ops import BYTES_PER_ELEMENT, Kind, Op, ops
 from .parts import PartModel, parts
@@ -176,9 +176,9 @@ def step_costs_ms(model: LatencyModel, steps: Steps) -> Floats:
 
 
 def latencies_ms(model: LatencyModel | PartModel, steps: Steps) -> Floats:
-    """The latency of each op list, in milliseconds: (lists,)."""
+    """The latency of each op list in its fastest form, in milliseconds: (lists,)."""
     if isinstance(model, PartModel):
-        return np.array([model.total_ms(parts(found)) for found in steps.lists])
+        return np.array([model.fastest_ms(parts(found)) for found in steps.lists])
     return steps.summed(step_costs_ms(model, steps))
 
 
@@ -192,6 +192,17 @@ def predict_ms(model: LatencyModel | PartModel, arch: Arch, resolution: tuple[in
     if isinstance(model, LatencyModel):
         require_costs(model, steps)
     return float(latencies_ms(model, steps)[0])
+
+
+def fastest_forms(
+    model: LatencyModel | PartModel, arch: Arch, resolution: tuple[int, int]
+) -> tuple[Form, ...] | None:
+    """The forms of the stages' 3D convs in which `predict_ms` takes the network to run; None where
+    the model knows one form alone.
+    """
+    if isinstance(model, LatencyModel):
+        return None
+    return model.forms(parts(ops(arch, resolution)))
 
 
 def require_costs(model: LatencyModel, steps: Steps) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 from shutil import rmtree
 from statistics import median
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..model.arch import UNTRAINED, Arch, Precision
+from ..model.arch import UNTRAINED, Arch, Form, Precision
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
 from .calibrate import FORMS, fit
@@ -67,6 +67,7 @@ class Sample(BaseModel):
     arch: Arch
     resolution: Resolution
     precision: Precision
+    forms: tuple[Form, ...] | None = None
     latency_ms: Annotated[float, Field(gt=0)]
     reference_ms: Annotated[float, Field(gt=0)]
     ratio: Annotated[float, Field(gt=0)]
@@ -102,7 +103,7 @@ class Bench:
         weakref.finalize(self, rmtree, self._folder, ignore_errors=True)
         reference = self._exported(*REFERENCE, "reference")
         self._reference = Reference(open_session("onnxruntime", reference, "fp32", threads).run)
-        self._last: tuple[Arch, Resolution] | None = None
+        self._last: tuple[Any, ...] | None = None
 
     def time(self, job: Job) -> Timing:
         """One network as a whole, as carefully as can be."""
@@ -117,27 +118,35 @@ class Bench:
             arch=job.arch,
             resolution=job.resolution,
             precision=job.precision,
+            forms=job.forms,
             latency_ms=timing.median_ms,
             reference_ms=timing.reference_ms,
             ratio=timing.ratio,
             error=timing.error,
             reliable=timing.reliable,
-            parts_ms=per_part(nodes, job.arch, timing.median_ms),
+            parts_ms=per_part(nodes, job.arch, timing.median_ms, job.forms),
         )
 
     def _graph(self, job: Job) -> Path:
         """The network's file; the one before is kept, for its other precisions."""
-        if self._last != (job.arch, job.resolution):
-            self._exported(job.arch, job.resolution, "network")
-            self._last = (job.arch, job.resolution)
+        known = job.arch, job.resolution, job.forms
+        if self._last != known:
+            self._exported(job.arch, job.resolution, "network", job.forms)
+            self._last = known
         return self._folder / "network.onnx"
 
-    def _exported(self, arch: Arch, resolution: Resolution, name: str) -> Path:
+    def _exported(
+        self,
+        arch: Arch,
+        resolution: Resolution,
+        name: str,
+        forms: tuple[Form, ...] | None = None,
+    ) -> Path:
         from ..model.checkpoint import build
         from ..model.export import export
 
         path = self._folder / f"{name}.onnx"
-        export(build(arch), path, resolution, UNTRAINED)
+        export(build(arch), path, resolution, UNTRAINED, forms=forms)
         return path
 
     def _opened(self, path: Path, precision: Precision) -> Session:
@@ -286,7 +295,7 @@ def _harvest(sample: Sample, usual_ms: float) -> Harvest:
     scale = sample.ratio * usual_ms / sample.latency_ms
     parts_ms = {part: ms * scale for part, ms in sample.parts_ms.items()}
     drift = 0.0 if sample.reliable else log(sample.reference_ms / usual_ms)
-    return Harvest(sample.arch, sample.resolution, parts_ms, sample.error, drift)
+    return Harvest(sample.arch, sample.resolution, parts_ms, sample.error, drift, sample.forms)
 
 
 def _undrifted(harvest: Harvest, power: float) -> Harvest:
@@ -302,6 +311,7 @@ def _point(sample: Sample, harvest: Harvest, runtime: Runtime, source: str) -> P
         runtime=runtime,
         precision=sample.precision,
         resolution=sample.resolution,
+        forms=sample.forms,
         fps=1000 / sum(harvest.ms.values()),
         evidence="measured",
         source=source,

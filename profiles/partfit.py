@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.arch import Arch
+from ..model.arch import Arch, Form
 from ..model.errors import Rts2Error
 from ..model.ops import ops
 from .parts import AXES, Floats, Part, PartModel, PartTable, axis_values, parts
@@ -68,6 +68,8 @@ class Harvest(NamedTuple):
     drift: float = 0.0
     """How much slower than usual (ln) the reference ran beside it, where the machine was busy;
     divided out of `ms` already, as if both slowed down alike."""
+    forms: tuple[Form, ...] | None = None
+    """Of the stages' 3D convs; all are 3d without them."""
 
 
 def fit_parts(harvests: Sequence[Harvest]) -> PartModel:
@@ -141,11 +143,11 @@ class _Rows:
         groups = groups or tuple(product(AXES, sizes))
         number = {group: index for index, group in enumerate(groups)}
         rows = [
-            (part, index, number[part.name, part.pixels], harvest.ms[part.name], *harvest[3:])
+            (part, index, number[part.name, part.pixels], harvest.ms[part.name])
             for index, harvest in enumerate(harvests)
             for part in _parts(harvest)
         ]
-        told, network, group, ms, error, drift = zip(*rows, strict=True)
+        told, network, group, ms = zip(*rows, strict=True)
         every = np.empty(len(told), object)
         every[:] = told
         return cls(
@@ -153,8 +155,8 @@ class _Rows:
             np.array(network),
             np.array(group),
             np.array(ms, float),
-            np.array(error, float),
-            np.array(drift, float),
+            np.array([harvests[index].error for index in network]),
+            np.array([harvests[index].drift for index in network]),
             groups,
         )
 
@@ -172,7 +174,7 @@ class _Rows:
 
 
 def _parts(harvest: Harvest) -> tuple[Part, ...]:
-    return parts(ops(harvest.arch, harvest.resolution))
+    return parts(ops(harvest.arch, harvest.resolution), harvest.forms)
 
 
 class _Fit:
@@ -216,17 +218,20 @@ class _Fit:
     def model(self) -> PartModel:
         """The tables."""
         tables = {}
+        timed = {self._groups[group][0] for group in self._bases}
         for name in AXES:
+            if name.startswith("banded.") and name not in timed:
+                continue  # nobody asked for that form
             axes = axis_values(name)
             places = list(product(*axes))
             told = []
             for size in self._sizes:
                 group = self._groups.index((name, size))
-                if group not in self._bases:
+                if group not in self._bases and not name.startswith("banded."):
                     raise Rts2Error(f"no network with {name} was timed at {size} pixels; time more")
                 of_size = [Part(name, place, size) for place in places]
                 value = self._values[self._places_of(of_size)].sum(1)
-                cost = self._bases[group](np.array(places, float)) * np.exp(value)
+                cost = self._base_cost(group, np.array(places, float)) * np.exp(value)
                 told.append(tuple(float(f"{ms:.6g}") for ms in cost))
             tables[name] = PartTable(axes=axes, ms=tuple(told))
         return PartModel(pixels=tuple(self._sizes), tables=tables)
@@ -331,7 +336,7 @@ class _Base:
     @staticmethod
     def _columns(places: Floats) -> Floats:
         """1, x, x² of the first axis, the same with x filled up to blocks, and where it fills none;
-        each times 1 and the second axis where there is one.
+        each times 1, y and y² of the second axis where there is one (banded planes meet planes).
         """
         x = places[:, 0]
         columns = [np.ones_like(x), x, x**2]
@@ -341,4 +346,5 @@ class _Base:
         powers = np.stack(columns, 1)
         if places.shape[1] == 1:
             return powers
-        return np.concatenate([powers, powers * places[:, 1:2]], 1)
+        y = places[:, 1:2]
+        return np.concatenate([powers, powers * y, powers * y**2], 1)

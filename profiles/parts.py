@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ..model.arch import FACTORS, SPACE_C, SPACE_CONV3D, SPACE_D_MAX, STRIDES, Arch
+from ..model.arch import FACTORS, SPACE_C, SPACE_CONV3D, SPACE_D_MAX, STRIDES, Arch, Form
 from ..model.errors import Rts2Error
 from ..model.ops import Op
 
@@ -45,8 +45,9 @@ AXES: dict[str, tuple[str, ...]] = {
     **{f"semantics.{stage}": ("c",) for stage in range(3)},
     **{f"refine.{stage}": ("planes",) for stage in range(3)},
     **{f"head.{stage}": ("semantic",) for stage in range(3)},
+    **{f"banded.{stage}": ("width", "planes") for stage in range(3)},
 }
-"""The parts of a network, and what each depends on."""
+"""The parts of a network, and what each depends on: `banded` is `regularize` in its other form."""
 
 _VALUES = {"c": SPACE_C, "semantic": (0, 1)}
 
@@ -69,6 +70,13 @@ _ROOMS = (
 )
 
 
+def in_form(part: str, forms: Sequence[Form] | None) -> str:
+    """The name of a part where the stages' 3D convs have these forms; all are 3d without them."""
+    room, _, stage = part.partition(".")
+    banded = room == "regularize" and forms and forms[int(stage)] == "banded"
+    return f"banded.{stage}" if banded else part
+
+
 def part_of(node: str, stages: int) -> str:
     """The part that a node of an exported graph belongs to, by its name.
 
@@ -82,11 +90,16 @@ def part_of(node: str, stages: int) -> str:
     raise Rts2Error(f"the node {node} belongs to no part of the network, so its time is nobody's")
 
 
-def per_part(node_ms: Mapping[str, float], arch: Arch, total_ms: float) -> dict[str, float]:
+def per_part(
+    node_ms: Mapping[str, float],
+    arch: Arch,
+    total_ms: float,
+    forms: Sequence[Form] | None = None,
+) -> dict[str, float]:
     """Sums of times by node over each part, scaled so that they add up to `total_ms`."""
     found: dict[str, float] = {}
     for node, ms in node_ms.items():
-        part = part_of(node, arch.stages)
+        part = in_form(part_of(node, arch.stages), forms)
         found[part] = found.get(part, 0.0) + ms
     scale = total_ms / sum(found.values())
     return {part: ms * scale for part, ms in found.items()}
@@ -108,8 +121,8 @@ _KNOWN = {"around", "semantic", *(name.split(".")[0] for name in _ANCHORS)}
 """How the names of the steps begin."""
 
 
-def parts(steps: Sequence[Op]) -> tuple[Part, ...]:
-    """The parts that an op list of the family `rts2net` runs through.
+def parts(steps: Sequence[Op], forms: Sequence[Form] | None = None) -> tuple[Part, ...]:
+    """The parts that an op list of the family `rts2net` runs through, in these forms.
 
     Raises `Rts2Error` that names a step of another family.
     """
@@ -120,7 +133,8 @@ def parts(steps: Sequence[Op]) -> tuple[Part, ...]:
                 "time the network itself: rts2-profile measure"
             )
     semantic = int(any(op.name == "head.semantic" for op in steps))
-    return tuple(_part(_ANCHORS[op.name], op, semantic) for op in steps if op.name in _ANCHORS)
+    found = (_part(_ANCHORS[op.name], op, semantic) for op in steps if op.name in _ANCHORS)
+    return tuple(part._replace(name=in_form(part.name, forms)) for part in found)
 
 
 def _part(name: str, op: Op, semantic: int) -> Part:
@@ -211,6 +225,25 @@ class PartModel(BaseModel):
     def total_ms(self, found: Iterable[Part]) -> float:
         """What parts take one after the other."""
         return sum(self.cost_ms(part) for part in found)
+
+    def forms(self, found: Iterable[Part]) -> tuple[Form, ...]:
+        """For each stage of a network, given by its parts, the faster form of its 3D convs."""
+        return tuple(
+            "3d" if self._faster(part) is part else "banded"
+            for part in found
+            if part.name.startswith("regularize.")
+        )
+
+    def fastest_ms(self, found: Iterable[Part]) -> float:
+        """What parts take, each in its faster form."""
+        return self.total_ms(self._faster(part) for part in found)
+
+    def _faster(self, part: Part) -> Part:
+        """The part itself, or its banded form where that was timed and takes less."""
+        banded = part._replace(name=part.name.replace("regularize.", "banded."))
+        if banded.name == part.name or banded.name not in self.tables:
+            return part
+        return banded if self.cost_ms(banded) < self.cost_ms(part) else part
 
 
 def _scaled(known: Sequence[int], costs: Floats, pixels: int) -> float:

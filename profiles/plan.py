@@ -5,9 +5,10 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import cycle, product
+from itertools import chain, cycle, product, repeat
+from typing import Any, TypeVar, get_args
 
-from ..model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, Arch, Precision
+from ..model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, Arch, Form, Precision
 from .profile import Resolution
 
 RESOLUTIONS: tuple[Resolution, ...] = ((1242, 375), (640, 192))
@@ -30,6 +31,8 @@ class Job:
     arch: Arch
     resolution: Resolution
     precision: Precision
+    forms: tuple[Form, ...] | None = None
+    """Of the 3D convs, one a stage; all are 3d without them."""
 
 
 def random_candidate(chance: random.Random) -> Candidate:
@@ -42,16 +45,19 @@ def random_candidate(chance: random.Random) -> Candidate:
     )
 
 
+Value = TypeVar("Value")
+
+
 class Deck:
     """Values in random order, each of them once before any comes again."""
 
     def __init__(self, chance: random.Random) -> None:
         self._chance = chance
-        self._left: dict[str, list[int]] = {}
+        self._left: dict[str, list[Any]] = {}
 
-    def __call__(self, name: str, values: Sequence[int]) -> int:
+    def __call__(self, name: str, values: Sequence[Value]) -> Value:
         """The next of `values`, which `name` stands for."""
-        left = self._left.setdefault(name, [])
+        left: list[Value] = self._left.setdefault(name, [])
         if not left:
             left += self._chance.sample(values, len(values))
         return left.pop()
@@ -78,15 +84,17 @@ def jobs(seed: int, precisions: tuple[Precision, ...]) -> Iterator[Job]:
 
     First every c at both resolutions, and every head; then rounds of networks of all stage counts
     and variants in which every c comes once more. Planes and widths go round in the same way, for
-    each resolution.
+    each resolution; each width of the 3D convs takes its forms in turn.
     """
     chance = random.Random(seed)
     decks = {resolution: Deck(chance) for resolution in RESOLUTIONS}
-    for arch, resolution in _first(chance, decks):
-        yield from (Job(arch, resolution, precision) for precision in precisions)
-    while True:
-        for arch, resolution in _round(chance, decks):
-            yield from (Job(arch, resolution, precision) for precision in precisions)
+    form = Deck(chance)
+    rounds = (_round(chance, decks) for _ in repeat(None))
+    for arch, resolution in chain(_first(chance, decks), chain.from_iterable(rounds)):
+        forms = tuple(
+            form(f"{stage} {width}", get_args(Form)) for stage, width in enumerate(arch.conv3d)
+        )
+        yield from (Job(arch, resolution, precision, forms) for precision in precisions)
 
 
 def _first(chance: random.Random, decks: dict[Resolution, Deck]) -> list[Candidate]:

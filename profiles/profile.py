@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..model.arch import Arch, Precision
+from ..model.arch import Arch, Form, Precision
 from ..model.errors import UsageError
 from ..model.files import parse_json, read_json
 from ..model.ops import Kind
@@ -74,6 +74,8 @@ class Point(Frozen):
     runtime: Runtime
     precision: Precision
     resolution: Resolution
+    forms: tuple[Form, ...] | None = None
+    """Of the stages' 3D convs; all are 3d without them."""
     fps: Annotated[float, Field(ge=1e-3, le=1e6)]
     evidence: Literal["published", "measured"]
     source: str

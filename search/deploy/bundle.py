@@ -171,7 +171,8 @@ def _export(
     from ...model.export import OPSET, Deployed, export, parity
 
     opset = support.opset or OPSET
-    export(network, path, deployment.input.resolution, origin, opset=opset)
+    resolution, forms = deployment.input.resolution, deployment.forms
+    export(network, path, resolution, origin, opset=opset, forms=forms)
     refuse_operators(path, support)
     left, right = (torch.from_numpy(np.ascontiguousarray(image)) for image in sample)
     found = parity(path, network, left, right)

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ...model.arch import MEAN, STD, Arch, Precision
+from ...model.arch import MEAN, STD, Arch, Form, Precision
 from ...model.box import Figures
 from ...model.files import read_json, sha256
 from ...model.ops import padded
 from ...profiles.evidence import Evidence
+from ...profiles.latency import fastest_forms
 from ...profiles.profile import Profile, Resolution, Runtime
 from ..result import Found
 from ..result import Point as FrontPoint
@@ -102,6 +103,8 @@ class Deployment(_Frozen):
     arch: Arch
     precision: Precision
     runtime: Runtime
+    forms: tuple[Form, ...] | None = None
+    """Of each stage's 3D convs in the graph: the faster ones there; None where all are 3d."""
     input: Input
     outputs: tuple[Output, ...]
     expected: Expected | None
@@ -179,6 +182,7 @@ def of_arch(
         arch=arch,
         precision=precision,
         runtime=runtime,
+        forms=_forms(arch, profile, precision, runtime, resolution),
         input=Input(resolution=resolution, shape=(1, 3, height, width)),
         outputs=tuple(outputs),
         expected=None,
@@ -186,6 +190,18 @@ def of_arch(
         files=(),
         versions={"rts2": version("rts2")},
     )
+
+
+def _forms(
+    arch: Arch, profile: Profile, precision: Precision, runtime: Runtime, resolution: Resolution
+) -> tuple[Form, ...] | None:
+    """The forms that the device runs fastest, as far as both were timed there."""
+    for known in profile.calibrations:
+        same = (known.runtime, known.precision) == (runtime, precision)
+        if same and arch.family == "rts2net":
+            forms = fastest_forms(known.model, arch, resolution) or ()
+            return forms if "banded" in forms else None
+    return None
 
 
 def describe(path: Path) -> File:

@@ -10,7 +10,6 @@ import pytest
 from rts2.model.arch import Arch, Precision
 from rts2.model.ops import ops, padded
 from rts2.profiles.here import this_machine
-from rts2.profiles.latency import predict_ms
 from rts2.profiles.measure import Bench, Journal, Sample, profile_of
 from rts2.profiles.parts import AXES, PartModel, PartTable, axis_values, parts
 from rts2.profiles.plan import RESOLUTIONS, Job, jobs
@@ -28,6 +27,8 @@ def cost_ms(part: str, place: tuple[int, ...], pixels: int) -> float:
     first, *rest = place
     grown = ceil(first / 16) if AXES[part] == ("c",) else first / 16
     planes = rest[0] if rest else 1
+    if part.startswith("banded."):  # faster up to seven planes
+        return (0.6 + planes / 20) * cost_ms(part.replace("banded", "regularize"), place, pixels)
     return (1 + list(AXES).index(part)) * pixels / 1e6 * (0.2 + grown) * (1 + 0.1 * planes)
 
 
@@ -66,7 +67,7 @@ class Planted(Bench):
         self.timed: list[Job] = []
 
     def latency_ms(self, job: Job) -> float:
-        whole = predict_ms(TRUTH, job.arch, job.resolution)
+        whole = TRUTH.total_ms(parts(ops(job.arch, job.resolution), job.forms))
         return self.factor * FACTORS[job.precision] * whole
 
     def time(self, job: Job) -> Timing:
@@ -78,12 +79,13 @@ class Planted(Bench):
 
     def harvest(self, job: Job) -> Sample:
         timing = self.time(job)
-        found = parts(ops(job.arch, job.resolution))
+        found = parts(ops(job.arch, job.resolution), job.forms)
         scale = timing.median_ms / TRUTH.total_ms(found)
         return Sample(
             arch=job.arch,
             resolution=job.resolution,
             precision=job.precision,
+            forms=job.forms,
             latency_ms=timing.median_ms,
             reference_ms=timing.reference_ms,
             ratio=timing.ratio,

@@ -13,7 +13,7 @@ from rts2.model.errors import Rts2Error
 from rts2.profiles.calibrate import fit, leave_one_out, recalibrated
 from rts2.profiles.check import Comparison, coverage, fresh, held_out, report
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.plan import Job, jobs
+from rts2.profiles.plan import jobs
 from rts2.profiles.profile import Profile, load
 from rts2.search.space import Space
 
@@ -161,7 +161,8 @@ def test_fresh_networks_are_judged_by_the_profile_that_claims_them(
     bench.factor = exp(0.07)
     found = checked(exact, bench)
     assert [c.residual for c in found] == pytest.approx([0.07] * 5)
-    assert [Job(c.arch, c.resolution, c.precision) for c in found] == bench.timed
+    timed = [(job.arch, job.resolution, job.precision) for job in bench.timed]
+    assert [(c.arch, c.resolution, c.precision) for c in found] == timed
     told = report(exact, found)
     assert (told["n"], told["within_5"], told["within_10"]) == (5, 0.0, 1.0)
     assert (coverage(exact, found, 0.5), coverage(exact, found, 0.9)) == (0, 1)
@@ -224,3 +225,15 @@ def test_errors_are_finite_fractions() -> None:
         assert 0 < told["mape"] <= told["max_ape"] < 1
         assert 0 <= told["within_5"] <= told["within_10"] <= 1
         assert np.isfinite(told["spearman"])
+
+
+def test_fresh_networks_run_in_the_forms_that_the_profile_takes_for_the_fastest(
+    exact: Profile, planted: Any
+) -> None:
+    """On the made-up machine that is banded up to seven planes: always from the second stage on."""
+    bench = planted()
+    found = checked(exact, bench, 40)
+    for job in bench.timed:
+        expected = ("banded" if job.arch.d_max <= 7 else "3d", "banded", "banded")
+        assert job.forms == expected[: job.arch.stages]
+    assert [c.residual for c in found] == pytest.approx([0.0] * 40, abs=0.02)

@@ -112,3 +112,24 @@ def test_a_part_that_one_network_alone_had_at_a_size_is_told_from_the_other_size
     ]
     (residual,) = left_out(alone, [alone.index(known[once])])
     assert abs(residual) < 0.1
+
+
+def test_both_forms_of_the_3d_convs_have_tables_of_their_own() -> None:
+    """Banded takes 0.8 times as long: every stage of every network is predicted in that form."""
+    known = []
+    for job in islice(jobs(0, ("fp32",)), 64):
+        found = parts(ops(job.arch, job.resolution), job.forms)
+        ms = {p.name: machine_ms(p) * (0.8 if "banded" in p.name else 1) for p in found}
+        known.append(Harvest(job.arch, job.resolution, ms, forms=job.forms))
+    model = fit_parts(known)
+    for arch, resolution in PLANNED[::5]:
+        found = parts(ops(arch, resolution))
+        assert model.forms(found) == ("banded",) * arch.stages
+        saved = 0.2 * sum(machine_ms(p) for p in found if "regularize" in p.name)
+        assert model.fastest_ms(found) == pytest.approx(model.total_ms(found) - saved, rel=0.02)
+
+
+def test_without_banded_timings_there_is_one_form_alone() -> None:
+    model = fit_parts(harvests())
+    assert not [name for name in model.tables if "banded" in name]
+    assert model.forms(parts(ops(*PLANNED[0]))) == ("3d",) * PLANNED[0][0].stages

@@ -444,10 +444,12 @@ class Slow:
             self.model = PartModel.model_validate_json(file.read())
     def harvest(self, job):
         time.sleep(0.02)
-        parts_ms = {p.name: self.model.cost_ms(p) for p in parts(ops(job.arch, job.resolution))}
+        found = parts(ops(job.arch, job.resolution), job.forms)
+        parts_ms = {part.name: self.model.cost_ms(part) for part in found}
         latency_ms = sum(parts_ms.values())
         return measure.Sample(
             arch=job.arch, resolution=job.resolution, precision=job.precision, reliable=True,
+            forms=job.forms,
             error=0.01, latency_ms=latency_ms, reference_ms=10, ratio=latency_ms / 10,
             parts_ms=parts_ms,
         )
@@ -479,7 +481,13 @@ def test_a_killed_fit_goes_on_from_its_samples_and_repeats_none(
     after = json.loads(journal.read_text())["samples"]
     assert after[: len(before)] == before
     timed = [
-        Job(Arch.model_validate(s["arch"]), tuple(s["resolution"]), s["precision"]) for s in after
+        Job(
+            Arch.model_validate(s["arch"]),
+            tuple(s["resolution"]),
+            s["precision"],
+            tuple(s["forms"]),
+        )
+        for s in after
     ]
     assert timed == list(islice(jobs(0, ("fp32",)), len(after)))
 

@@ -7,6 +7,7 @@ import pytest
 
 from rts2.model.arch import MEAN, STD, Arch
 from rts2.model.errors import Rts2Error, UsageError
+from rts2.profiles.parts import PartModel
 from rts2.profiles.profile import load
 from rts2.search.accuracy import source
 from rts2.search.deploy.configuration import Deployment, describe, of_arch, of_point, read
@@ -118,3 +119,26 @@ def test_a_configuration_never_changes() -> None:
     assert Deployment.model_validate(made.model_dump(by_alias=True)) == made
     with pytest.raises(ValueError, match="frozen"):
         made.device = "other"  # type: ignore[misc]
+
+
+def test_the_graph_holds_its_3d_convs_as_the_device_runs_them_fastest() -> None:
+    """A profile in which banded 3D convs take no time at all, and none in which they were timed."""
+    known = load("cpu")
+    (calibration,) = [c for c in known.calibrations if c.precision == "fp32"]
+    assert isinstance(calibration.model, PartModel)
+    tables = {
+        name: table
+        for name, table in calibration.model.tables.items()
+        if not name.startswith("banded.")
+    }
+    timed = tables["regularize.1"]
+    free = timed.model_copy(update={"ms": tuple((1e-6,) * len(row) for row in timed.ms)})
+    found = []
+    for more in ({}, {"banded.1": free}):
+        model = calibration.model.model_copy(update={"tables": tables | more})
+        faster = calibration.model_copy(update={"model": model})
+        profile = known.model_copy(update={"calibrations": (faster,)})
+        found.append(of_arch(Arch(c=1), profile, "fp32", "onnxruntime", (1242, 375)).forms)
+    assert found == [None, ("3d", "banded", "3d")]
+    anynet = of_arch(Arch(family="anynet", c=1), known, "fp32", "onnxruntime", (1242, 375))
+    assert anynet.forms is None
