@@ -21,7 +21,7 @@ from .calibrate import FORMS, fit
 from .heldout import hold_outs
 from .here import this_machine
 from .partfit import Harvest, damping, fit_parts, left_out
-from .parts import per_part
+from .parts import PartModel, per_part
 from .plan import Candidate, Job, random_candidate
 from .profile import (
     Calibration,
@@ -55,8 +55,8 @@ ASKED, ASKED_SEED = 200, 7
 WORTHLESS = 0.1
 """The standard error above which a timing tells a fit nothing."""
 
-NEEDED = 24
-"""Networks of one precision that tables can be made of."""
+NEEDED, NEEDED_LIKE = 24, 12
+"""Networks that tables can be made of: of the first precision, and of others that go like it."""
 
 
 class Sample(BaseModel):
@@ -190,7 +190,7 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
     """
     known = [sample for sample in journal.samples if sample.reliable]
     if not known:
-        raise _too_few(0)
+        raise _too_few(0, NEEDED)
     usual = median(sample.reference_ms for sample in known)
     machine = journal.machine
     title = titled(journal.runtime)
@@ -200,15 +200,11 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
         Fact(name="processor", value=machine.processor, source="the operating system"),
         Fact(name="threads", value=str(machine.threads), source="rts2-profile"),
     )
-    fitted = {
-        precision: _Fitted(
-            [sample for sample in journal.samples if sample.precision == precision],
-            journal.runtime,
-            usual,
-            source,
-        )
-        for precision in precisions
-    }
+    fitted: list[_Fitted] = []
+    for precision in precisions:
+        samples = [sample for sample in journal.samples if sample.precision == precision]
+        like = fitted[0].model if fitted else None
+        fitted.append(_Fitted(samples, journal.runtime, usual, source, like))
     return template.model_copy(
         update={
             "name": name,
@@ -216,9 +212,9 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
             "hardware": facts,
             "precisions": _precisions(template, precisions, title),
             "runtimes": _runtimes(template, journal),
-            "calibrations": tuple(known.calibration() for known in fitted.values()),
+            "calibrations": tuple(known.calibration() for known in fitted),
             "derivations": (),
-            "points": tuple(point for known in fitted.values() for point in known.points),
+            "points": tuple(point for known in fitted for point in known.points),
             "machine": machine.model_copy(update={"reference_ms": usual}),
         }
     )
@@ -247,23 +243,31 @@ def _runtimes(template: Profile, journal: Journal) -> tuple[RuntimeSupport, ...]
 
 
 class _Fitted:
-    """What was timed in one precision: points, and tables of them.
+    """What was timed in one precision: points, and tables of them, which may grow `like` others.
 
     Raises `Rts2Error` where too few timings are reliable.
     """
 
     def __init__(
-        self, samples: Sequence[Sample], runtime: Runtime, usual_ms: float, source: str
+        self,
+        samples: Sequence[Sample],
+        runtime: Runtime,
+        usual_ms: float,
+        source: str,
+        like: PartModel | None,
     ) -> None:
         self._worthless = sum(sample.error > WORTHLESS for sample in samples)
         samples = [sample for sample in samples if sample.error <= WORTHLESS]
         self._reliable = [index for index, sample in enumerate(samples) if sample.reliable]
-        if len(self._reliable) < NEEDED:
-            raise _too_few(len(self._reliable))
+        needed = NEEDED_LIKE if like else NEEDED
+        if len(self._reliable) < needed:
+            raise _too_few(len(self._reliable), needed)
         self._source = source
         seen = [_harvest(sample, usual_ms) for sample in samples]
-        power = damping(seen)
+        power = damping(seen, like)
+        self._like = like
         self._harvests = [_undrifted(harvest, power) for harvest in seen]
+        self.model = fit_parts(self._harvests, like)
         self.points = tuple(
             _point(samples[index], self._harvests[index], runtime, source)
             for index in self._reliable
@@ -275,11 +279,12 @@ class _Fitted:
         told = f", {busy} more of a busy machine weigh less" if busy else ""
         told += f", {self._worthless} more were worth nothing" if self._worthless else ""
         first = self.points[0]
+        errors = left_out(self._harvests, self._reliable, _asked(), self._like)
         return Calibration(
             runtime=first.runtime,
             precision=first.precision,
-            model=fit_parts(self._harvests),
-            residuals=tuple(map(float, left_out(self._harvests, self._reliable, _asked()))),
+            model=self.model,
+            residuals=tuple(map(float, errors)),
             source=f"times by node of {len(self.points)} whole networks{told}; {self._source}",
             held_out=hold_outs(self.points, lambda others: fit(others, FORMS["parts"])),
         )
@@ -319,9 +324,9 @@ def _point(sample: Sample, harvest: Harvest, runtime: Runtime, source: str) -> P
     )
 
 
-def _too_few(count: int) -> Rts2Error:
+def _too_few(count: int, needed: int) -> Rts2Error:
     return Rts2Error(
-        f"{count} reliable timings are too few for tables of parts, which need {NEEDED}; "
+        f"{count} reliable timings are too few for tables of parts, which need {needed}; "
         "the same command with a longer --budget goes on from here"
     )
 

@@ -50,6 +50,9 @@ TOTAL_NOISE: Final = 0.02
 that were timed again and again; half or twice any of them moves the error on unseen networks by a
 tenth of itself."""
 
+TICK_MS: Final = 1e-3
+"""What runtimes count times in: less reads as nothing."""
+
 DAMPED: Final = 0.5
 """How far the drift of a network is expected from that of the reference, as a power of it."""
 
@@ -72,19 +75,22 @@ class Harvest(NamedTuple):
     """Of the stages' 3D convs; all are 3d without them."""
 
 
-def fit_parts(harvests: Sequence[Harvest]) -> PartModel:
+def fit_parts(harvests: Sequence[Harvest], like: PartModel | None = None) -> PartModel:
     """The tables of every part from networks that were timed part by part.
+
+    Where those of another precision of the runtime are known, the base may also grow `like` them.
 
     Raises:
         Rts2Error: a part was not timed at one of the sizes.
     """
-    return _Fit(_Rows.of(harvests)).model()
+    return _Fit(_Rows.of(harvests), like).model()
 
 
 def left_out(
     harvests: Sequence[Harvest],
     chosen: Sequence[int] | None = None,
     asked: Sequence[Candidate] = (),
+    like: PartModel | None = None,
 ) -> Floats:
     """ln(true / predicted) of each network, or of the chosen ones, predicted from tables without
     it; scaled, where networks are given that will be `asked` about, to what those expect.
@@ -94,31 +100,31 @@ def left_out(
     standard error that its own prediction had, times the median one of the asked networks.
     """
     rows = _Rows.of(harvests)
-    usual = _usual_uncertainty(rows, asked) if asked else None
+    usual = _usual_uncertainty(rows, asked, like) if asked else None
     found = []
     for index in range(len(harvests)) if chosen is None else chosen:
         own = rows.where(rows.network == index)
-        others = _Fit(rows.where(rows.network != index))
+        others = _Fit(rows.where(rows.network != index), like)
         scale = usual / others.uncertainty(own) if usual else 1.0
         found.append(scale * np.log(own.ms.sum() / others.costs(own).sum()))
     return np.array(found)
 
 
-def _usual_uncertainty(rows: _Rows, asked: Sequence[Candidate]) -> float:
-    whole = _Fit(rows)
+def _usual_uncertainty(rows: _Rows, asked: Sequence[Candidate], like: PartModel | None) -> float:
+    whole = _Fit(rows, like)
     known = [Harvest(*candidate, defaultdict(float)) for candidate in asked]
     every = _Rows.of(known, rows.groups)
     told = (whole.uncertainty(every.where(every.network == index)) for index in range(len(known)))
     return float(np.median(list(told)))
 
 
-def damping(harvests: Sequence[Harvest]) -> float:
+def damping(harvests: Sequence[Harvest], like: PartModel | None = None) -> float:
     """By what power of the reference's drift a network's drift differs from the reference's.
 
     Others who use the machine delay a reference of small kernels more than most networks, whose
     ratio to it then comes out too small: below 0.
     """
-    return float(_Fit(_Rows.of(harvests)).damping)
+    return float(_Fit(_Rows.of(harvests), like).damping)
 
 
 @dataclass(frozen=True)
@@ -154,7 +160,7 @@ class _Rows:
             every,
             np.array(network),
             np.array(group),
-            np.array(ms, float),
+            np.maximum(ms, TICK_MS),
             np.array([harvests[index].error for index in network]),
             np.array([harvests[index].drift for index in network]),
             groups,
@@ -180,8 +186,9 @@ def _parts(harvest: Harvest) -> tuple[Part, ...]:
 class _Fit:
     """Bases, and what differs from them, found in turn."""
 
-    def __init__(self, rows: _Rows) -> None:
+    def __init__(self, rows: _Rows, like: PartModel | None) -> None:
         self._groups = rows.groups
+        self._like = like
         shared = {
             (name, value): index
             for index, (name, value) in enumerate(
@@ -197,9 +204,9 @@ class _Fit:
             differs = np.exp(self._differs(rows) + self.damping * rows.drift)
             for group in np.unique(rows.group):
                 own = rows.group == group
-                places = _places(rows.parts[own])
+                told = self._told(rows.parts[own])
                 sure = PART_NOISE / np.hypot(PART_NOISE, rows.error[own])
-                self._bases[int(group)] = _Base(places, (rows.ms / differs)[own], sure)
+                self._bases[int(group)] = _Base(told, (rows.ms / differs)[own], sure)
             self._solve(rows)
 
     def costs(self, rows: _Rows) -> Floats:
@@ -231,7 +238,7 @@ class _Fit:
                     raise Rts2Error(f"no network with {name} was timed at {size} pixels; time more")
                 of_size = [Part(name, place, size) for place in places]
                 value = self._values[self._places_of(of_size)].sum(1)
-                cost = self._base_cost(group, np.array(places, float)) * np.exp(value)
+                cost = self._base_cost(group, self._told(of_size)) * np.exp(value)
                 told.append(tuple(float(f"{ms:.6g}") for ms in cost))
             tables[name] = PartTable(axes=axes, ms=tuple(told))
         return PartModel(pixels=tuple(self._sizes), tables=tables)
@@ -240,17 +247,26 @@ class _Fit:
         found = np.empty(len(rows.ms))
         for group in np.unique(rows.group):
             own = rows.group == group
-            found[own] = self._base_cost(int(group), _places(rows.parts[own]))
+            found[own] = self._base_cost(int(group), self._told(rows.parts[own]))
         return found
 
-    def _base_cost(self, group: int, places: Floats) -> Floats:
+    def _told(self, found: Sequence[Part] | NDArray[np.object_]) -> _Told:
+        """What bases of these parts, all of one name, are computed from."""
+        like = self._like
+        known = like is not None and found[0].name in like.tables
+        return _Told(
+            np.array([part.at for part in found], float),
+            np.array([like.cost_ms(part) if like and known else 0.0 for part in found]),
+        )
+
+    def _base_cost(self, group: int, told: _Told) -> Floats:
         """The base of a part at one size; where it was timed at others alone, in proportion."""
         name, size = self._groups[group]
         known = [at for at in self._bases if self._groups[at][0] == name]
         if not known:
             raise Rts2Error(f"too few networks with {name} were timed; time more")
         nearest = min(known, key=lambda at: abs(self._groups[at][1] - size))
-        return self._bases[nearest](places) * (size / self._groups[nearest][1])
+        return self._bases[nearest](told) * (size / self._groups[nearest][1])
 
     def _differs(self, rows: _Rows) -> Floats:
         return np.asarray(self._values[self._places_of(rows.parts)].sum(1))
@@ -311,17 +327,22 @@ class _Fit:
         return 1 / np.concatenate([shared, own, [DAMPED]]) ** 2
 
 
-def _places(found: NDArray[np.object_]) -> Floats:
-    return np.array([part.at for part in found], float)
+class _Told(NamedTuple):
+    """What a base is computed from."""
+
+    places: Floats
+    """(n, axes)"""
+    like: Floats
+    """(n,): what the same part takes in another precision; 0 where that is unknown."""
 
 
 class _Base:
     """A cost that grows along a part's axes: non-negative least squares on relative error."""
 
-    def __init__(self, places: Floats, truth: Floats, sure: Floats) -> None:
+    def __init__(self, told: _Told, truth: Floats, sure: Floats) -> None:
         from scipy.optimize import nnls
 
-        columns = self._columns(places) * (sure / truth)[:, None]
+        columns = self._columns(told) * (sure / truth)[:, None]
         scale = columns.max(0)
         self._seen = scale > 0
         columns = columns[:, self._seen] / scale[self._seen]
@@ -330,21 +351,23 @@ class _Base:
         values, _ = nnls(np.concatenate([columns, small]), aims)
         self._values = values / scale[self._seen]
 
-    def __call__(self, places: Floats) -> Floats:
-        return np.asarray(self._columns(places)[:, self._seen] @ self._values)
+    def __call__(self, told: _Told) -> Floats:
+        return np.asarray(self._columns(told)[:, self._seen] @ self._values)
 
     @staticmethod
-    def _columns(places: Floats) -> Floats:
+    def _columns(told: _Told) -> Floats:
         """1, x, x² of the first axis, the same with x filled up to blocks, and where it fills none;
-        each times 1, y and y² of the second axis where there is one (banded planes meet planes).
+        each times 1, y and y² of the second axis where there is one (banded planes meet planes);
+        and what another precision takes.
         """
+        places = told.places
         x = places[:, 0]
         columns = [np.ones_like(x), x, x**2]
         for block in BLOCKS:
             filled, open_ = block * np.ceil(x / block), x % block > 0
             columns += [filled, filled**2, x * open_, x**2 * open_]
         powers = np.stack(columns, 1)
-        if places.shape[1] == 1:
-            return powers
-        y = places[:, 1:2]
-        return np.concatenate([powers, powers * y, powers * y**2], 1)
+        if places.shape[1] > 1:
+            y = places[:, 1:2]
+            powers = np.concatenate([powers, powers * y, powers * y**2], 1)
+        return np.column_stack([powers, told.like])

@@ -14,6 +14,9 @@ from .profile import Resolution
 RESOLUTIONS: tuple[Resolution, ...] = ((1242, 375), (640, 192))
 """KITTI's, and about a quarter of its pixels: between them a latency is interpolated."""
 
+CORNERS = 4
+"""Whole networks at both ends of c, at both resolutions."""
+
 HEADS = 12
 """Heads of shallower networks and other variants than the whole one, at both resolutions."""
 
@@ -84,17 +87,22 @@ def jobs(seed: int, precisions: tuple[Precision, ...]) -> Iterator[Job]:
 
     First every c at both resolutions, and every head; then rounds of networks of all stage counts
     and variants in which every c comes once more. Planes and widths go round in the same way, for
-    each resolution; each width of the 3D convs takes its forms in turn.
+    each resolution; each width of the 3D convs takes its forms in turn. The first precision is
+    timed throughout, the others after the heads in every other pair of networks: they go much like
+    the first.
     """
     chance = random.Random(seed)
     decks = {resolution: Deck(chance) for resolution in RESOLUTIONS}
     form = Deck(chance)
     rounds = (_round(chance, decks) for _ in repeat(None))
-    for arch, resolution in chain(_first(chance, decks), chain.from_iterable(rounds)):
+    chosen = chain(_first(chance, decks), chain.from_iterable(rounds))
+    for count, (arch, resolution) in enumerate(chosen):
         forms = tuple(
             form(f"{stage} {width}", get_args(Form)) for stage, width in enumerate(arch.conv3d)
         )
-        yield from (Job(arch, resolution, precision, forms) for precision in precisions)
+        both = count < CORNERS + HEADS or count // 2 % 2 == 0
+        timed = precisions if both else precisions[:1]
+        yield from (Job(arch, resolution, precision, forms) for precision in timed)
 
 
 def _first(chance: random.Random, decks: dict[Resolution, Deck]) -> list[Candidate]:
@@ -116,7 +124,7 @@ def _first(chance: random.Random, decks: dict[Resolution, Deck]) -> list[Candida
         (_arch(decks[resolution], c, 3, (True, True)), resolution)
         for c, resolution in corners + whole
     ]
-    return [*told[: len(corners)], *shallow[:HEADS], *told[len(corners) :], *shallow[HEADS:]]
+    return [*told[:CORNERS], *shallow[:HEADS], *told[CORNERS:], *shallow[HEADS:]]
 
 
 def _round(chance: random.Random, decks: dict[Resolution, Deck]) -> Iterator[Candidate]:

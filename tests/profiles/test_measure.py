@@ -110,12 +110,23 @@ def test_the_same_seed_plans_the_same_networks_and_another_others() -> None:
     assert len({stream[FIRST:] for stream in streams}) == 6
 
 
-def test_every_network_is_timed_in_each_precision_in_turn() -> None:
-    both = planned(60, precisions=("fp32", "bf16"))
-    assert [job.precision for job in both] == ["fp32", "bf16"] * 30
-    alone = [(job.arch, job.resolution) for job in planned(30)]
-    for precision in (0, 1):
-        assert [(job.arch, job.resolution) for job in both[precision::2]] == alone
+def test_the_first_precision_is_timed_throughout_the_others_with_every_other_pair() -> None:
+    """All corners and heads in both; then half of the networks, both resolutions alike."""
+    both = planned(200, precisions=("fp32", "bf16"))
+    alone = [(job.arch, job.resolution, job.forms) for job in planned(200)]
+    told = {
+        precision: [(j.arch, j.resolution, j.forms) for j in both if j.precision == precision]
+        for precision in ("fp32", "bf16")
+    }
+    assert told["fp32"] == alone[: len(told["fp32"])]
+    assert (
+        told["bf16"]
+        == [job for index, job in enumerate(told["fp32"]) if index < 16 or index // 2 % 2 == 0][
+            : len(told["bf16"])
+        ]
+    )
+    sizes = [resolution for _, resolution, _ in told["bf16"][16:40]]
+    assert sizes.count((1242, 375)) == sizes.count((640, 192))
 
 
 def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(
@@ -304,13 +315,13 @@ def test_each_precision_has_its_own_tables_and_is_told_as_supported(planted: Any
         ("openvino", "fp32"),
         ("openvino", "bf16"),
     ]
-    for known in found.calibrations:
+    for known, count in zip(found.calibrations, (48, 32), strict=True):
         points = found.points_of("openvino", known.precision)
-        assert len(known.residuals) == len(points) == 40
+        assert len(known.residuals) == len(points) == count
     single, half = (known.model for known in found.calibrations)
     for job in planned(10, seed=4):
         assert predict_ms(half, job.arch, job.resolution) == pytest.approx(
-            0.6 * predict_ms(single, job.arch, job.resolution), rel=1e-4
+            0.6 * predict_ms(single, job.arch, job.resolution), rel=0.03
         )
     told = {support.precision: support for support in found.precisions}
     assert len(told) == len(found.precisions)
