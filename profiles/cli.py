@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 CONFIDENCE = 0.9
 
+BUSY_SHARE = 1 / 3
+"""A fit with more timings of a busy machine than this is told to be one."""
+
 RESERVE_S, FITTING_S = 5.0, 0.12
 """What of a fit's budget is kept for the last network and the tables, and for each one's error."""
 
@@ -393,6 +396,12 @@ def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Pro
     remaining = islice(jobs(options.seed, bench.precisions), len(journal.samples), None)
     for job in _until(deadline, remaining, len(journal.samples)):
         journal = extend(journal, journal_path, bench.harvest(job))
+    busy = sum(not sample.reliable for sample in journal.samples)
+    if busy > BUSY_SHARE * len(journal.samples):
+        _warn(
+            f"{busy} of {len(journal.samples)} networks were timed while the machine was busy and "
+            "tell little; close what else runs here, delete the timings and fit again"
+        )
     name = re.sub("[^a-z0-9._-]+", "-", path.stem.lower()).strip("._-")
     return profile_of(journal, template, name or template.name)
 

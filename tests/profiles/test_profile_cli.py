@@ -350,6 +350,26 @@ def test_a_budget_leaves_time_for_the_tables(
     assert run(*asked, "--budget", 60, "--json").json["n"] == 33
 
 
+def test_a_fit_on_a_busy_machine_is_told_to_be_one(
+    run: Any, made_up: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every second network of 60, and every fourth: more and less than a third."""
+    plain = made_up.time
+    for each, told in ((2, True), (4, False)):
+
+        def time(bench: Any, job: Job, each: int = each) -> Timing:
+            bench.busy = len(bench.timed) % each == 1
+            found: Timing = plain(bench, job)
+            return found
+
+        monkeypatch.setattr(made_up, "time", time)
+        asked = ("fit", "--device", "cpu", "--threads", 1, "--budget", 60)
+        found = run(*asked, "--out", tmp_path / f"{each}.json")
+        assert found.code == 0
+        assert ("of 60 networks were timed while the machine was busy" in found.err) == told
+        assert found.err.count("\n") == told
+
+
 def test_a_budget_without_a_single_timing_is_one_line(
     run: Any, made_up: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
