@@ -78,6 +78,22 @@ class Sample(BaseModel):
     parts_ms: dict[str, Annotated[float, Field(ge=0)]]
     """What of the latency each part took."""
 
+    @classmethod
+    def of(cls, job: Job, timing: Timing, parts_ms: dict[str, float]) -> Sample:
+        """What a journal keeps of one timing."""
+        return cls(
+            arch=job.arch,
+            resolution=job.resolution,
+            precision=job.precision,
+            forms=job.forms,
+            latency_ms=timing.median_ms,
+            reference_ms=timing.reference_ms,
+            ratio=timing.ratio,
+            error=timing.error,
+            reliable=timing.reliable,
+            parts_ms=parts_ms,
+        )
+
 
 class Journal(BaseModel):
     """What was timed so far: an interrupted fit goes on from here."""
@@ -114,18 +130,8 @@ class Bench:
         session = self._opened(self._graph(job), job.precision)
         timing = measure(session.run, self._reference, FIT_ERROR, FIT_PATIENCE)
         nodes = session.node_times_ms(PROFILED_RUNS)
-        return Sample(
-            arch=job.arch,
-            resolution=job.resolution,
-            precision=job.precision,
-            forms=job.forms,
-            latency_ms=timing.median_ms,
-            reference_ms=timing.reference_ms,
-            ratio=timing.ratio,
-            error=timing.error,
-            reliable=timing.reliable,
-            parts_ms=per_part(nodes, job.arch, timing.median_ms, job.forms),
-        )
+        parts_ms = per_part(nodes, job.arch, timing.median_ms, job.forms)
+        return Sample.of(job, timing, parts_ms)
 
     def _graph(self, job: Job) -> Path:
         """The network's file; the one before is kept, for its other precisions."""

@@ -81,18 +81,8 @@ class Planted(Bench):
         timing = self.time(job)
         found = parts(ops(job.arch, job.resolution), job.forms)
         scale = timing.median_ms / TRUTH.total_ms(found)
-        return Sample(
-            arch=job.arch,
-            resolution=job.resolution,
-            precision=job.precision,
-            forms=job.forms,
-            latency_ms=timing.median_ms,
-            reference_ms=timing.reference_ms,
-            ratio=timing.ratio,
-            error=timing.error,
-            reliable=timing.reliable,
-            parts_ms={part.name: scale * TRUTH.cost_ms(part) for part in found},
-        )
+        parts_ms = {part.name: scale * TRUTH.cost_ms(part) for part in found}
+        return Sample.of(job, timing, parts_ms)
 
     def journal(self, count: int, drifts: Iterable[float] = (), seed: int = 0) -> Journal:
         """The first `count` networks of a fit; sample k at `drifts[k]` where there is one."""
