@@ -16,7 +16,7 @@ from ..model.ops import ops
 from .heldout import hold_outs
 from .kit import fewshot
 from .latency import Floats, LatencyModel, Steps, latencies_ms
-from .partfit import Harvest, fit_parts, left_out
+from .partfit import Harvest, fit_parts
 from .parts import PartModel
 from .profile import Calibration, Point, Profile
 
@@ -56,7 +56,7 @@ def _again(profile: Profile, known: Calibration) -> Calibration:
     return calibrated(points, known.model, known.source)
 
 
-def calibrated(points: Sequence[Point], form: Form, source: str) -> Calibration:
+def calibrated(points: Sequence[Point], form: LatencyModel, source: str) -> Calibration:
     """`form` fitted to the points of one runtime and precision, with the errors of each left out,
     of each family left out, and of each stage count.
     """
@@ -70,10 +70,8 @@ def calibrated(points: Sequence[Point], form: Form, source: str) -> Calibration:
     )
 
 
-def leave_one_out(points: Sequence[Point], form: Form) -> Floats:
+def leave_one_out(points: Sequence[Point], form: LatencyModel) -> Floats:
     """ln(true / predicted) of each point, predicted by a fit on all the others."""
-    if isinstance(form, PartModel):
-        return left_out(_harvests(points))
     needed = len(form.ms_per) + 2
     if len(points) < needed:
         raise Rts2Error(
