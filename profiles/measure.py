@@ -12,16 +12,17 @@ from statistics import median
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..model.arch import UNTRAINED, Arch, Form, Precision
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
+from ..model.ops import ops
 from .calibrate import FORMS, fit
 from .heldout import hold_outs
 from .here import this_machine
 from .partfit import Harvest, damping, fit_parts, left_out
-from .parts import PartModel, per_part
+from .parts import PartModel, parts, per_part
 from .plan import Candidate, Job, random_candidate
 from .profile import (
     Calibration,
@@ -77,6 +78,16 @@ class Sample(BaseModel):
     reliable: bool
     parts_ms: dict[str, Annotated[float, Field(ge=0)]]
     """What of the latency each part took."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> Sample:
+        if self.forms is not None and len(self.forms) != self.arch.stages:
+            raise ValueError(f"forms must be one for each of {self.arch.stages} stages")
+        found = parts(ops(self.arch, self.resolution), self.forms)
+        missing = [part.name for part in found if part.name not in self.parts_ms]
+        if missing:
+            raise ValueError(f"parts_ms lacks {missing[0]}")
+        return self
 
     @classmethod
     def of(cls, job: Job, timing: Timing, parts_ms: dict[str, float]) -> Sample:
