@@ -208,6 +208,8 @@ class Kernel:
     origin: Origin
     ms: float
     """The fastest of its runs: what else runs on the machine only ever adds."""
+    kind: str = ""
+    """What the runtime calls the operator that it runs; empty for what is no step of its graph."""
 
 
 def kernels(
@@ -219,13 +221,15 @@ def kernels(
     without being a step of the graph counts for the node of the step that ran next.
     """
     origins = Tracer(nodes, steps).origins()
+    kinds = {step.node.name: step.node.kind for step in steps}
     ran = list(dict.fromkeys(name for run in runs for name in run))
     found = []
     latest: Origin | None = None
     for name in reversed(ran):
         beside = latest or Origin(nodes[-1].name, "inserted")
         latest = origins.get(name) or Origin(beside.node, "inserted")
-        found.append(Kernel(name, latest, min(run[name] for run in runs if name in run)))
+        fastest = min(run[name] for run in runs if name in run)
+        found.append(Kernel(name, latest, fastest, kinds.get(name, "")))
     return tuple(reversed(found))
 
 

@@ -20,6 +20,12 @@ LAYOUT: Final = frozenset(("ReorderInput", "ReorderOutput"))
 BLOCKED = re.compile(r"(?P<value>.+)_nchwc(_token_\d+)?")
 """A step on channels in blocks has the name of the value that it gives."""
 
+FUSED = re.compile(r"(?P<node>.+)_token_\d+")
+"""A step of integers has the name of the node that it was made of."""
+
+TRANSPOSED = re.compile(r"Transpose(_token_\d+)?")
+"""What a layout of channels last brings along; nodes of a file of ours have longer names."""
+
 PROFILED_WARM_UP = 1
 """Runs before the first that counts: the arena grows in the first."""
 
@@ -114,6 +120,7 @@ def _steps(optimized: Any) -> list[Step]:
 
 
 def _step(node: Node) -> Step:
-    blocked = BLOCKED.fullmatch(node.name)
-    told = (node.name,) if blocked is None else (blocked["value"],)
-    return Step(node, told, moves=node.kind in LAYOUT)
+    blocked, fused = BLOCKED.fullmatch(node.name), FUSED.fullmatch(node.name)
+    told = blocked["value"] if blocked else fused["node"] if fused else node.name
+    moves = node.kind in LAYOUT or TRANSPOSED.fullmatch(node.name) is not None
+    return Step(node, (told,), moves)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ...model.arch import Precision
 from ...model.errors import Rts2Error
@@ -40,6 +43,17 @@ class Session:
     def run(self) -> None:
         """One pair through the network."""
         self._request.infer()
+
+    def answer(
+        self, outputs: Sequence[str], inputs: Mapping[str, NDArray[np.float32]]
+    ) -> list[NDArray[Any]]:
+        """What the graph gives for these inputs, by the names of its outputs."""
+        import openvino
+
+        for name, values in inputs.items():
+            self._request.set_tensor(name, openvino.Tensor(np.ascontiguousarray(values)))
+        self._request.infer()
+        return [self._request.get_tensor(name).data.copy() for name in outputs]
 
     def node_times_ms(self, runs: int) -> dict[str, float]:
         """What each node of the file takes, by its name (see `kernels`)."""
