@@ -23,12 +23,15 @@ from .inference import open_session
 from .ops import padded
 
 if TYPE_CHECKING:
+    from onnx import ModelProto
     from torch import Tensor
 
     from .checkpoint import Network
     from .rts2net import Stage
 
 Input = NDArray[np.float32]
+
+UNSAVED: Final = Path("the graph")
 
 MULTIPLE: Final = 32
 """What the sides are padded to for a graph that does not name its arch."""
@@ -139,14 +142,19 @@ class OnnxPredictor:
     and perhaps `semantic`, int32 (1, H, W).
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, model: bytes | None = None) -> None:
         self.path = path
-        self.session = open_session(path)
+        self.session = open_session(path, model=model)
         self.size = _input_size(self.session, path)
         self.outputs = _outputs(self.session, self.size, path)
         header = _header(self.session, path)
         self.arch = None if header is None else header.arch
         self.origin = None if header is None else header.origin
+
+    @classmethod
+    def of(cls, model: ModelProto, path: Path = UNSAVED) -> OnnxPredictor:
+        """A graph that is in no file; errors name `path`."""
+        return cls(path, model.SerializeToString())
 
     def predict(self, left: Bytes, right: Bytes, stages: int | None = None) -> Estimate:
         stage = None if self.arch is None else self.arch.stages
