@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from ..model.arch import Precision
 from ..model.box import named_model
+from ..model.bundle import graph_of
 from ..model.console import (
     KITTI,
     add_output,
@@ -17,33 +20,47 @@ from ..model.console import (
     figure,
     parser,
     print_json,
-    progress,
     resolution,
     screen,
+    seed,
 )
 from ..model.data.catalog import STREETS, open_dataset
 from ..model.data.scene import Sample
 from ..model.errors import UsageError
-from ..model.files import existing_file, output_folder, write_bytes, write_json
+from ..model.files import existing_file, output_folder, remove, write_bytes, write_json
+from ..model.machine import cores
+from ..profiles.profile import Profile, load, names
 
 if TYPE_CHECKING:
-    from onnx import ModelProto
+    from .budget import Budget
+    from .report import Metrics, Report, Row
+    from .source import Source
 
-    from ..model.graph import GraphHeader
-    from .parity import Measured
-    from .report import Metrics, Report
+FLOAT, REPORT, PAGE, PICTURE = "fp32.onnx", "quantize.json", "report.html", "audit.png"
+CACHE: Final = "calibration.npz"
 
-FLOAT, QUANTIZED, REPORT = "fp32.onnx", "fp16.onnx", "quantize.json"
+MADE: Final = ("int8.onnx", "fp16.onnx", "openvino.onnx", FLOAT, PAGE, PICTURE, REPORT)
+"""What an earlier run may have left, and a later one with another outcome does not write."""
 
-STREETS_JUDGED: Final = 20
-"""How many streets --eval takes."""
+HERE: Final = "cpu"
+"""The device of int8 and bf16 unless told: the machine at hand."""
 
-EXPORT = ("resolution", "stages", "opset")
-"""The options that shape the export of a checkpoint."""
+PAIRS: Final = 32
+"""How many pairs calibrate unless told."""
 
-NOTE = (
+JUDGED: Final = 20
+"""How many streets judge."""
+
+SHOWN: Final = 3
+"""How many frames the page shows."""
+
+TARGET: Final = (
     "rounded to fp16 after every operator, as a target with fp16 units does; fp16.onnx is for "
     "TensorRT and CUDA: ONNX Runtime on a CPU runs it through casts, no faster than fp32"
+)
+BY_RULES: Final = (
+    "the profile's rules decided, nothing was timed: build and time it on the device "
+    "(rts2-profile kit times networks there)"
 )
 
 
@@ -51,14 +68,12 @@ NOTE = (
 def quantize(arguments: Sequence[str] | None = None) -> int:
     """The command rts2-quantize: a trained network in lower precision, measured."""
     options = _parser().parse_args(arguments)
-    if options.precision == "int8":
-        raise UsageError("int8 is not built yet in this version, fp16 is: --precision fp16")
-    existing_file(options.model, "a model (a checkpoint or an ONNX file)")
-    frames = _frames(options)
+    profile = _profile(options)
+    path = existing_file(graph_of(options.model), "a model (a checkpoint or an ONNX file)")
     out = output_folder(options.out)
-    with TemporaryDirectory() as folder:
-        report = _quantized(options, frames, Path(folder), out)
-    write_json(out / REPORT, report.to_json())
+    with TemporaryDirectory(prefix="rts2.") as folder:
+        run = _Run(options, profile, path, out, Path(folder))
+        report = run.done()
     if options.json:
         print_json(report.to_json())
     else:
@@ -67,144 +82,403 @@ def quantize(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    command = parser(
+    described = parser(
         "rts2-quantize",
-        "A trained network in lower precision, with what it costs in accuracy.",
-        "rts2-quantize kitti2015.tar --precision fp16 --eval KITTI --out kitti2015-fp16",
+        "A trained network in lower precision: faster where it was measured to be, within what "
+        "may be lost in accuracy, or else the float network as it was.",
+        "rts2-quantize c8 --precision int8 --calib KITTI --eval KITTI --out c8-int8",
     )
+    add = described.add_argument
     text = "a checkpoint (rts2's .safetensors, AnyNet's released .tar) or an .onnx file of rts2"
-    text = f"{text}, or the name of a network in the box"
-    command.add_argument("model", type=named_model, metavar="MODEL", help=text)
-    command.add_argument("--precision", required=True, choices=("fp16", "int8"))
+    text = f"{text}, a bundle, or the name of a network in the box"
+    add("model", type=named_model, metavar="MODEL", help=text)
+    add("--precision", required=True, choices=("fp16", "bf16", "int8"))
     text = (
-        "D1, EPE and mIoU before and after: on KITTI 2015 (the folder that holds training/), on "
-        f"any pairs (left/, right/, disparity/), or on generated {STREETS}"
+        f"{', '.join(names())}, or a profile's JSON file. On the machine at hand (default for int8 "
+        "and bf16) layers are timed; for others the profile's rules decide; fp16 without a device "
+        "is for TensorRT and CUDA"
     )
-    command.add_argument("--eval", type=Path, metavar=f"DIR|{STREETS}", help=text)
+    add("--device", metavar="NAME|FILE", help=text)
+    text = (
+        "pairs that calibrate int8: KITTI 2015 (the folder that holds training/), any pairs "
+        f"(left/, right/), or generated {STREETS} (default)"
+    )
+    add("--calib", type=Path, default=Path(STREETS), metavar=f"DIR|{STREETS}", help=text)
+    text = f"how many of them, the first ones (default: {PAIRS})"
+    add("--pairs", type=_count, default=PAIRS, metavar="N", help=text)
+    text = "how ranges are told from what was seen (default: percentile)"
+    add("--method", choices=("minmax", "percentile", "entropy"), default="percentile", help=text)
+    text = (
+        "pairs with a truth that judge: a folder as for --calib with disparity/ and perhaps "
+        f"semantic/, or generated {STREETS} (default)"
+    )
+    add("--eval", type=Path, default=Path(STREETS), metavar=f"DIR|{STREETS}", help=text)
+    text = "points that D1-all may rise (default: 0.3 for int8, 0.05 for fp16 and bf16)"
+    add("--max-d1-drop", type=_points, metavar="POINTS", help=text)
+    text = "points that mIoU may fall (default: 0.5 for int8, 0.1 for fp16 and bf16)"
+    add("--max-miou-drop", type=_points, metavar="POINTS", help=text)
     text = "of the images, for a checkpoint (default: {}x{})".format(*KITTI)
-    command.add_argument("--resolution", type=resolution, metavar="WxH", help=text)
-    text = "for a checkpoint: stop after this many stages"
-    command.add_argument("--stages", type=int, metavar="K", help=text)
+    add("--resolution", type=resolution, metavar="WxH", help=text)
+    add("--stages", type=int, metavar="K", help="for a checkpoint: stop after this many stages")
     text = "for a checkpoint: ONNX operator set (TensorRT 8.2 needs 13)"
-    command.add_argument("--opset", type=int, metavar="N", help=text)
-    add_output(command)
-    return command
+    add("--opset", type=int, metavar="N", help=text)
+    add("--threads", type=_count, metavar="N", help="of the machine at hand (default: all cores)")
+    add("--seed", type=seed, default=0, help=f"of the {STREETS} that calibrate (default: 0)")
+    add_output(described)
+    return described
 
 
-def _frames(options: argparse.Namespace) -> Sequence[Sample]:
-    """What --eval names; streets come at the network's own size."""
-    folder: Path | None = options.eval
-    if folder is None:
-        return ()
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 100_000):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 100000, not {text!r}")
+    return int(text)
+
+
+def _points(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 <= value <= 100:
+        raise argparse.ArgumentTypeError(f"must be from 0 to 100 points, not {text!r}")
+    return value
+
+
+def _profile(options: argparse.Namespace) -> Profile | None:
+    """The device that the network is for; None for fp16 that any TensorRT or CUDA device takes.
+
+    Raises `UsageError` where the device does not run the precision.
+    """
+    if options.device is None and options.precision == "fp16":
+        return None
+    profile = load(options.device or HERE)
+    if profile.machine is not None:
+        return profile
+    refusal = profile.refusal(options.precision)
+    if refusal is not None:
+        raise UsageError(f"{profile.title} does not run {options.precision}: {refusal.reason}")
+    return profile
+
+
+class _Run:
+    """One quantization, from the options to the files; `folder` holds what lies in between."""
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        profile: Profile | None,
+        path: Path,
+        out: Path,
+        folder: Path,
+    ) -> None:
+        from .source import Asked, Source
+
+        self.options, self.profile, self.out, self.folder = options, profile, out, folder
+        asked = Asked(options.resolution, options.stages, self._opset(options, profile))
+        self.source: Source = Source(path, asked, folder)
+        self.precision: Precision = options.precision
+        self.frames = _opened(options.eval, self.source.resolution, "val", JUDGED, 0)
+        """What judges; streets come at the network's own size."""
+        self.threads = options.threads or cores()
+
+    @staticmethod
+    def _opset(options: argparse.Namespace, profile: Profile | None) -> int | None:
+        """What the device's importer reads, where the device is not at hand."""
+        if options.opset is not None or profile is None or profile.machine is not None:
+            given: int | None = options.opset
+            return given
+        told = [known.opset for known in profile.runtimes if known.opset is not None]
+        return min(told) if told and options.model.suffix.lower() != ".onnx" else None
+
+    def done(self) -> Report:
+        """Quantizes, judges, writes."""
+        here = self.profile is not None and self.profile.machine is not None
+        if self.precision == "int8":
+            return self._integers_here() if here else self._integers_by_rules()
+        return self._half_here() if here else self._half_for_target()
+
+    @property
+    def budget(self) -> Budget:
+        from .budget import HALF, INT8, Budget
+
+        usual = INT8 if self.precision == "int8" else HALF
+        given = self.options.max_d1_drop, self.options.max_miou_drop
+        return Budget(
+            usual.max_d1_drop if given[0] is None else given[0],
+            usual.max_miou_drop if given[1] is None else given[1],
+        )
+
+    def _integers_here(self) -> Report:
+        from .ptq import Setting, quantize
+        from .report import calibrated, in_forms, rows, trial
+
+        setting = Setting(
+            self.pairs,
+            self.frames,
+            self.budget,
+            self.options.method,
+            self.threads,
+            self.out / CACHE,
+            self.folder,
+        )
+        found = quantize(self.source, setting)
+        own = self.folder / "int8.onnx"
+        self._save(found.model, found.header, own)
+        report = self._timed(found, own, "ONNX Runtime", "fp32")
+        return self._written(
+            _with(
+                report,
+                layers=rows(found),
+                calibration=calibrated(found.calibration, setting.method, str(self.options.calib)),
+                forms=in_forms(found.float_forms, found.header.forms),
+                trials=tuple(map(trial, found.trials)),
+            ),
+            {FLOAT: found.parent, "int8.onnx": own} if found.delivered else {FLOAT: found.parent},
+        )
+
+    def _half_here(self) -> Report:
+        from .half import quantize
+        from .report import in_forms
+
+        found = quantize(self.source, self.precision, self.frames, self.budget, self.threads)
+        report = self._timed(found, found.graph, "OpenVINO", "fp32 in ONNX Runtime")
+        files = {FLOAT: found.parent}
+        if found.delivered:
+            files["openvino.onnx"] = found.graph
+        forms = in_forms(found.float_forms, found.header.forms)
+        return self._written(_with(report, forms=forms), files)
+
+    def _integers_by_rules(self) -> Report:
+        from .report import Report, calibrated, metrics, named, rows_by_rules
+        from .rules import quantize
+
+        assert self.profile is not None, "int8 is for a device"
+        found = quantize(
+            self.source,
+            self.pairs,
+            self.frames,
+            self.budget,
+            self.options.method,
+            self.out / CACHE,
+        )
+        own = self.folder / "int8.onnx"
+        self._save(found.model, found.header, own)
+        names = sorted({*found.kept, *found.chosen})
+        files = {FLOAT: found.parent, "int8.onnx": own} if found.within else {FLOAT: found.parent}
+        report = Report(
+            network=named(found.header),
+            precision=self.precision,
+            outcome="int8" if found.within else "fp32",
+            why=BY_RULES if found.within else "no choice of layers keeps the accuracy budget",
+            device=self.profile.name,
+            runtime="tensorrt",
+            evidence="rules",
+            machine=None,
+            measured_on=self.judged_on,
+            reference=metrics(found.measured.reference, found.parent.stat().st_size),
+            quantized=metrics(found.measured.other, own.stat().st_size, found.measured.sqnr_db),
+            budget=self.budget,
+            layers=rows_by_rules(names, found.kept, found.effects),
+            calibration=calibrated(found.calibration, self.options.method, str(self.options.calib)),
+        )
+        return self._written(report, files)
+
+    def _half_for_target(self) -> Report:
+        from .budget import drops
+        from .fp16 import emulated, kept_float, to_fp16
+        from .parity import measure
+        from .report import Report, Row, metrics, named
+        from .source import opened
+
+        if self.precision == "bf16":
+            raise UsageError("bf16 is for CPUs, through OpenVINO: give --device cpu, or fp16")
+        parent = self.source.graph(next(iter(self.source.forms), None))
+        model, header = opened(parent)
+        lowered = to_fp16(model)
+        header = header.model_copy(update={"precision": "fp16"})
+        own, rounded = self.folder / "fp16.onnx", self.folder / "emulated.onnx"
+        self._save(lowered, header, own)
+        self._save(emulated(lowered), header, rounded)
+        from ..model.predictor import OnnxPredictor
+
+        found = measure(OnnxPredictor(parent), OnnxPredictor(rounded), self._scenes())
+        drops(found)
+        within = self.budget.holds(found)
+        convs = [node.name for node in model.graph.node if node.op_type == "Conv"]
+        files = {FLOAT: parent, "fp16.onnx": own} if within else {FLOAT: parent}
+        report = Report(
+            network=named(header),
+            precision=self.precision,
+            outcome="fp16" if within else "fp32",
+            why=TARGET if within else "fp16 leaves the accuracy budget: fp32 is delivered",
+            device=None if self.profile is None else self.profile.name,
+            runtime="tensorrt",
+            evidence="rules",
+            machine=None,
+            measured_on=self.judged_on,
+            reference=metrics(found.reference, parent.stat().st_size),
+            quantized=metrics(found.other, own.stat().st_size, found.sqnr_db),
+            budget=self.budget,
+            layers=(
+                *(Row(name, "fp16", None) for name in convs),
+                *(Row(kept.layer, "fp32", kept.reason) for kept in kept_float(model)),
+            ),
+        )
+        return self._written(report, files)
+
+    def _timed(self, found: Any, own: Path, title: str, parent: str) -> Report:
+        """What a duel on this machine came to."""
+        from .report import Report, latencies, metrics, named, sentence
+
+        assert self.profile is not None, "what is timed is timed on a device"
+        measured, duel = found.measured, found.duel
+        before, after = latencies(duel)
+        return Report(
+            network=named(found.header),
+            precision=self.precision,
+            outcome=self.precision if found.delivered else "fp32",
+            why=sentence(found.delivered, self.precision, duel, found.within, parent),
+            device=self.profile.name,
+            runtime="onnxruntime" if title == "ONNX Runtime" else "openvino",
+            evidence="measured",
+            machine=self._machine(title),
+            measured_on=self.judged_on,
+            reference=metrics(measured.reference, found.parent.stat().st_size, latency_ms=before),
+            quantized=metrics(measured.other, own.stat().st_size, measured.sqnr_db, after),
+            budget=self.budget,
+            speedup=1 / duel.ratio,
+            speedup_error=duel.timing.error,
+        )
+
+    def _machine(self, title: str) -> str:
+        from ..profiles.here import this_machine
+
+        runtime = "onnxruntime" if title == "ONNX Runtime" else "openvino"
+        known = this_machine(runtime, self.threads)
+        return (
+            f"{known.processor}, {self.threads} threads, {title} {known.versions[runtime]}, "
+            f"{known.date}"
+        )
+
+    @cached_property
+    def pairs(self) -> Sequence[Sample]:
+        """What calibrates."""
+        options = self.options
+        return _opened(options.calib, self.source.resolution, "train", options.pairs, options.seed)[
+            : options.pairs
+        ]
+
+    @property
+    def judged_on(self) -> str:
+        """What judges, in words."""
+        return f"{len(self.frames)} frames of {self.options.eval}"
+
+    def _scenes(self) -> Iterator[Any]:
+        from ..model.console import progress
+
+        frames = self.frames
+        return (frame.read() for frame in progress(frames, "judging", len(frames)))
+
+    @staticmethod
+    def _save(model: Any, header: Any, path: Path) -> None:
+        from ..model.graph import save_graph
+
+        save_graph(model, header, path)
+
+    def _written(self, report: Report, files: dict[str, Path]) -> Report:
+        """The report with its files, all of them in the output folder."""
+        given = self.source.given
+        kept = {name: path for name, path in files.items() if not (given and name == FLOAT)}
+        for name, path in kept.items():
+            write_bytes(self.out / name, path.read_bytes())
+        for name in MADE:
+            if name not in kept:
+                remove(self.out / name)
+        complete = report.with_files([*kept, REPORT])
+        write_json(self.out / REPORT, complete.to_json())
+        return complete
+
+
+def _with(report: Report, **values: Any) -> Report:
+    from dataclasses import replace
+
+    return replace(report, **values)
+
+
+def _opened(
+    folder: Path, size: tuple[int, int], split: str, streets: int, seed: int
+) -> Sequence[Sample]:
+    """The pairs of a folder in any layout; for the streets their size, split, number and seed."""
     if str(folder) == STREETS:
-        return open_dataset(STREETS, count=STREETS_JUDGED, size=_resolution(options))
+        return open_dataset(STREETS, split=split, count=streets, size=size, seed=seed)
     layout = "folder" if (folder / "left").is_dir() else "kitti2015"
     return open_dataset(layout, folder)
 
 
-def _resolution(options: argparse.Namespace) -> tuple[int, int]:
-    """Width and height of the images that the network is for."""
-    if options.model.suffix.lower() != ".onnx":
-        return options.resolution or KITTI
-    from ..model.graph import read_header
-
-    return read_header(options.model).resolution
-
-
-def _quantized(
-    options: argparse.Namespace, frames: Sequence[Sample], folder: Path, out: Path
-) -> Report:
-    """Quantizes and measures in `folder`; what passed is written to `out`."""
-    from ..model.graph import header_of, load_graph, save_graph
-    from .fp16 import emulated, kept_float, to_fp16
-    from .report import Report, metrics
-
-    source = _float_graph(options, folder)
-    model = load_graph(source)
-    header = header_of(model, source)
-    if header.precision != "fp32":
-        raise UsageError(f"a float graph is needed: {source} is {header.precision} already")
-    lowered = to_fp16(model)
-    header = header.model_copy(update={"precision": "fp16"})
-    save_graph(lowered, header, folder / QUANTIZED)
-    save_graph(emulated(lowered), header, folder / "emulated.onnx")
-    measured = _measured(source, folder / "emulated.onnx", frames, header)
-    names = [QUANTIZED, FLOAT] if source.parent == folder else [QUANTIZED]
-    for name in names:
-        write_bytes(out / name, (folder / name).read_bytes())
-    scenes = f"{len(frames)} frames of {options.eval}" if frames else "one synthetic pair"
-    return Report(
-        network=_named(header),
-        precision=header.precision,
-        scenes=scenes,
-        reference=metrics(measured.reference, source.stat().st_size),
-        quantized=metrics(measured.other, (folder / QUANTIZED).stat().st_size, measured.sqnr_db),
-        kept=tuple(kept_float(model)),
-        layers=_convolutions(model),
-        files=(*names, REPORT),
-    )
-
-
-def _float_graph(options: argparse.Namespace, folder: Path) -> Path:
-    """The ONNX file given, or the export of the checkpoint given."""
-    source: Path = options.model
-    given = [name for name in EXPORT if getattr(options, name) is not None]
-    if source.suffix.lower() == ".onnx":
-        if given:
-            raise UsageError(f"--{given[0]} is for checkpoints; {source} is exported already")
-        return source
-    from ..model.checkpoint import load
-    from ..model.export import OPSET, export
-
-    network, header = load(source)
-    size, opset = _resolution(options), options.opset or OPSET
-    export(network, folder / FLOAT, size, header.origin, opset, options.stages)
-    return folder / FLOAT
-
-
-def _measured(
-    reference: Path, other: Path, frames: Sequence[Sample], header: GraphHeader
-) -> Measured:
-    from ..model.predictor import open_model
-    from .parity import measure, synthetic_scene
-
-    models = open_model(reference), open_model(other)
-    if not frames:
-        return measure(*models, [synthetic_scene(header.resolution)])
-    shown = progress(frames, "images", len(frames))
-    return measure(*models, (frame.read() for frame in shown))
-
-
-def _named(header: GraphHeader) -> str:
-    width, height = header.resolution
-    return f"{header.arch.label()} · {width}×{height} · {header.origin}"
-
-
-def _convolutions(model: ModelProto) -> tuple[str, ...]:
-    return tuple(node.name for node in model.graph.node if node.op_type == "Conv")
-
-
 def _show(report: Report, out: Path) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for index, column in enumerate(("", "D1-all %", "EPE px", "mIoU %", "kB", "SQNR dB")):
-        table.add_column(column, justify="right" if index else "left")
-    table.add_row("fp32", *_row(report.reference))
-    table.add_row(report.precision, *_row(report.quantized))
-    counts = Counter(kept.reason for kept in report.kept)
     console = screen()
     console.print(report.network, markup=False)
-    console.print(table)
+    if any(row.float_ms is not None for row in report.layers):
+        console.print(_audit(report.layers))
+        console.print("")
+    console.print(_metrics(report))
+    counts = Counter(_kind(row.reason) for row in report.kept if row.reason)
     for line in (
-        f"measured on {report.scenes}, {NOTE}",
-        *(f"kept float  {count} operators, {reason}" for reason, count in counts.items()),
+        f"outcome     {report.outcome}: {report.why}",
+        f"judged on   {report.measured_on}",
+        *(f"kept float  {count} layers, {reason}" for reason, count in counts.items()),
+        *([f"timed on    {report.machine}"] if report.machine else []),
         f"written     {out}/  {'  '.join(report.files)}",
     ):
         console.print(line, markup=False, soft_wrap=True)
 
 
+def _kind(reason: str) -> str:
+    """A reason without the figures of one layer."""
+    return reason.split(": ", 1)[0].split(" (", 1)[0]
+
+
+def _metrics(report: Report) -> Any:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for index, column in enumerate(("", "ms", "D1-all %", "EPE px", "mIoU %", "kB", "SQNR dB")):
+        table.add_column(column, justify="right" if index else "left")
+    table.add_row("fp32", *_row(report.reference))
+    table.add_row(report.precision, *_row(report.quantized))
+    return table
+
+
 def _row(metrics: Metrics) -> list[str]:
-    figures = ((metrics.d1_all, 2), (metrics.epe, 3), (metrics.miou, 2))
-    texts = [figure(value, digits) for value, digits in figures]
-    return [*texts, figure(metrics.size_bytes / 1000, 0), figure(metrics.sqnr_db, 1)]
+    size = None if metrics.size_bytes is None else metrics.size_bytes / 1000
+    figures = (
+        (metrics.latency_ms, 1),
+        (metrics.d1_all, 2),
+        (metrics.epe, 3),
+        (metrics.miou, 2),
+        (size, 0),
+        (metrics.sqnr_db, 1),
+    )
+    return [figure(value, digits) for value, digits in figures]
+
+
+def _audit(rows: Sequence[Row]) -> Any:
+    """The kernel audit: a row a layer."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    columns = ("layer", "runs in", "fp32 ms", "int8 ms", "SQNR dB", "D1 +", "EPE +", "kernels")
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("layer", "kernels") else "right")
+    for row in rows:
+        kernels = row.quantized_kernels if row.precision == "int8" else row.float_kernels
+        figures = (
+            (row.float_ms, 2),
+            (row.quantized_ms, 2),
+            (row.sqnr_db, 1),
+            (row.d1_change, 3),
+            (row.epe_change, 4),
+        )
+        told = [figure(value, digits) for value, digits in figures]
+        table.add_row(row.layer, row.precision, *told, " ".join(kernels))
+    return table

@@ -34,7 +34,7 @@ def sqnr_db(reference: NDArray[Any], other: NDArray[Any]) -> float:
     """
     if reference.shape != other.shape:
         raise Rts2Error(f"both must have one shape: {reference.shape}, {other.shape}")
-    return _decibels(*_powers(reference, other))
+    return decibels(*powers(reference, other))
 
 
 def measure(reference: Predictor, other: Predictor, scenes: Iterable[Scene]) -> Measured:
@@ -43,13 +43,13 @@ def measure(reference: Predictor, other: Predictor, scenes: Iterable[Scene]) -> 
     Raises `Rts2Error` where `other` fails, or gives values that are not finite.
     """
     scores = [Score(), Score()]
-    powers = np.zeros(2)
+    total = np.zeros(2)
     for scene in scenes:
         estimates = reference.predict(scene.left, scene.right), _finite(other, scene)
-        powers += _powers(estimates[0].disparity, estimates[1].disparity)
+        total += powers(estimates[0].disparity, estimates[1].disparity)
         for index, (model, estimate) in enumerate(zip((reference, other), estimates, strict=True)):
             scores[index] += score(estimate, scene, model.arch)
-    return Measured(scores[0], scores[1], _decibels(*powers))
+    return Measured(scores[0], scores[1], decibels(*total))
 
 
 def synthetic_scene(resolution: tuple[int, int]) -> Scene:
@@ -77,13 +77,14 @@ def _finite(model: Predictor, scene: Scene) -> Estimate:
     return estimate
 
 
-def _powers(reference: NDArray[Any], other: NDArray[Any]) -> tuple[float, float]:
-    """The power of the signal and that of the noise."""
+def powers(reference: NDArray[Any], other: NDArray[Any]) -> tuple[float, float]:
+    """Σ reference² and Σ (reference − other)²: the power of the signal and that of the noise."""
     signal = reference.astype(np.float64)
     return float(np.square(signal).sum()), float(np.square(signal - other).sum())
 
 
-def _decibels(signal: float, noise: float) -> float:
+def decibels(signal: float, noise: float) -> float:
+    """10·log10(signal / noise); infinite without noise."""
     with np.errstate(divide="ignore"):
         return float(10 * (np.log10(signal) - np.log10(noise))) if noise else float("inf")
 

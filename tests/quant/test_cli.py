@@ -18,6 +18,9 @@ from rts2.quant.cli import quantize
 from rts2.quant.parity import SHIFT_PX, synthetic_scene
 
 SIZE = (96, 64)
+LENIENT = ("--max-d1-drop", 100, "--max-miou-drop", 100)
+"""For networks of random weights, whose answers hang in the balance everywhere."""
+
 METRICS = ["latency_ms", "d1_all", "epe", "miou", "size_bytes", "sqnr_db"]
 
 
@@ -51,21 +54,25 @@ def test_a_checkpoint_becomes_two_graphs_and_a_report(
 ) -> None:
     out = tmp_path / "new" / "out"
     size = ("--resolution", "90x50")
-    assert run(checkpoint, "--precision", "fp16", "--out", out, *size, "--json") == 0
+    assert run(checkpoint, "--precision", "fp16", "--out", out, *size, *LENIENT, "--json") == 0
     report = reported(capsys)
     assert report == json.loads((out / "quantize.json").read_text())
     assert report["schema"] == "rts2.quantize/1"
-    assert report["measured_on"] == "one synthetic pair"
+    assert report["measured_on"] == "20 frames of streets"
+    assert (report["outcome"], report["evidence"]) == ("fp16", "rules")
     assert list(report["float"]) == list(report["quantized"]) == METRICS
     for name, file in (("float", "fp32.onnx"), ("quantized", "fp16.onnx")):
         metrics = report[name]
         assert metrics.pop("size_bytes") == (out / file).stat().st_size
         assert (metrics.pop("sqnr_db") or 99) > 40
-        assert set(metrics.values()) == {None}
+        assert metrics.pop("latency_ms") is None
+        assert None not in metrics.values()
     assert report["float"].get("sqnr_db") is None
     reason = report["kept_float"][0]["reason"]
     assert {"layer": "refine.0.regression/Softmax", "reason": reason} in report["kept_float"]
-    assert {"layer": "encoder.stem.0.0/Conv", "precision": "fp16"} in report["layers"]
+    told = {row["layer"]: (row["precision"], row["reason"]) for row in report["layers"]}
+    assert told["encoder.stem.0.0/Conv"] == ("fp16", None)
+    assert told["refine.0.regression/Softmax"] == ("fp32", reason)
     assert sorted(path.name for path in out.iterdir()) == sorted(report["files"])
     before, after = (read_header(out / name) for name in ("fp32.onnx", "fp16.onnx"))
     assert (before.precision, after.precision) == ("fp32", "fp16")
@@ -81,9 +88,9 @@ def test_an_onnx_file_gives_the_same_and_is_left_alone(
     checkpoint: Path, graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = graph.read_bytes()
-    size = ("--resolution", "96x64")
+    size = ("--resolution", "96x64", *LENIENT)
     assert run(checkpoint, "--precision", "fp16", "--out", tmp_path / "a", *size) == 0
-    assert run(graph, "--precision", "fp16", "--out", tmp_path / "b") == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path / "b", *LENIENT) == 0
     assert graph.read_bytes() == before
     files = [tmp_path / name / "fp16.onnx" for name in "ab"]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -91,14 +98,14 @@ def test_an_onnx_file_gives_the_same_and_is_left_alone(
 
 
 def test_stages_and_opset_shape_the_export(checkpoint: Path, tmp_path: Path) -> None:
-    export = ("--resolution", "96x64", "--stages", 1, "--opset", 13)
+    export = ("--resolution", "96x64", "--stages", 1, "--opset", 13, *LENIENT)
     assert run(checkpoint, "--precision", "fp16", "--out", tmp_path, *export) == 0
     assert read_header(tmp_path / "fp16.onnx").stages == 1
     assert [entry.version for entry in load_graph(tmp_path / "fp16.onnx").opset_import] == [13]
 
 
 def test_the_result_runs(graph: Path, tmp_path: Path) -> None:
-    assert run(graph, "--precision", "fp16", "--out", tmp_path) == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path, *LENIENT) == 0
     scene = synthetic_scene(SIZE)
     wanted, found = (
         open_model(path).predict(scene.left, scene.right)
@@ -112,13 +119,14 @@ def test_the_result_runs(graph: Path, tmp_path: Path) -> None:
 def test_people_get_a_table(
     graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(graph, "--precision", "fp16", "--out", tmp_path) == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path, *LENIENT) == 0
     shown = capsys.readouterr().out
     assert "c=1, 3 stages, full · 96×64 · made up for a test" in shown
     assert "SQNR dB" in shown
-    assert "measured on one synthetic pair, rounded to fp16 after every operator" in shown
+    assert "judged on   20 frames of streets" in shown
+    assert "outcome     fp16: rounded to fp16 after every operator" in shown
     assert "ONNX Runtime on a CPU runs it through casts, no faster" in shown
-    assert "28 operators, warp coordinate" in shown
+    assert "28 layers, warp coordinate" in shown
 
 
 def kitti(folder: Path, size: tuple[int, int] = SIZE) -> Path:
@@ -142,7 +150,7 @@ def test_evaluation_is_that_of_the_networks(
 ) -> None:
     data = kitti(tmp_path / "data")
     out = tmp_path / "out"
-    assert run(graph, "--precision", "fp16", "--eval", data, "--out", out, "--json") == 0
+    assert run(graph, "--precision", "fp16", "--eval", data, "--out", out, *LENIENT, "--json") == 0
     report = reported(capsys)
     scene = synthetic_scene(SIZE)
     error = np.abs(open_model(graph).predict(scene.left, scene.right).disparity - SHIFT_PX)
@@ -189,9 +197,9 @@ def test_a_model_in_the_box_goes_by_its_name(
 ) -> None:
     (tmp_path / "small.safetensors").write_bytes(checkpoint.read_bytes())
     monkeypatch.setattr("rts2.model.box._folder", lambda: tmp_path)
-    size = ("--resolution", "96x64")
+    size = ("--resolution", "96x64", *LENIENT)
     assert run("small", "--precision", "fp16", "--out", tmp_path / "a", *size) == 0
-    assert run(graph, "--precision", "fp16", "--out", tmp_path / "b") == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path / "b", *LENIENT) == 0
     files = [tmp_path / name / "fp16.onnx" for name in "ab"]
     assert files[0].read_bytes() == files[1].read_bytes()
 
@@ -214,13 +222,6 @@ def test_an_onnx_file_needs_no_torch(graph: Path, tmp_path: Path) -> None:
     ]
     ran = subprocess.run(command, capture_output=True, text=True)
     assert (ran.returncode, ran.stderr) == (0, "")
-
-
-def test_int8_is_not_built_yet(
-    graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    said = "int8 is not built yet in this version, fp16 is: --precision fp16"
-    refused(capsys, 2, said, graph, "--precision", "int8", "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -264,7 +265,7 @@ def test_wrong_exports(
 
 def test_a_model_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path in (tmp_path / "a.onnx", tmp_path / "a.safetensors", tmp_path):
-        said = "a model (a checkpoint or an ONNX file) must be a file"
+        said = "a model must be a file or a bundle" if path == tmp_path else "must be a file"
         refused(capsys, 2, said, path, "--precision", "fp16", "--out", tmp_path / "out")
 
 
@@ -287,7 +288,7 @@ def test_a_truncated_model(
 def test_a_graph_that_is_fp16_already(
     graph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(graph, "--precision", "fp16", "--out", tmp_path) == 0
+    assert run(graph, "--precision", "fp16", "--out", tmp_path, *LENIENT) == 0
     capsys.readouterr()
     lowered = tmp_path / "fp16.onnx"
     said = f"a float graph is needed: {lowered} is fp16 already"
@@ -304,7 +305,7 @@ def test_a_network_that_fp16_cannot_hold(
     large = 3e4 * np.sign(onnx.numpy_helper.to_array(weight))
     weight.CopyFrom(onnx.numpy_helper.from_array(large.astype(np.float32), weight.name))
     save_graph(model, read_header(graph), tmp_path / "a.onnx")
-    said = "one synthetic pair: in this precision the network leaves the range of its numbers; keep"
+    said = "val-000000: in this precision the network leaves the range of its numbers; keep"
     refused(capsys, 1, said, tmp_path / "a.onnx", "--precision", "fp16", "--out", tmp_path / "out")
 
 

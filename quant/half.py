@@ -1,0 +1,98 @@
+"""Half precision on the CPU at hand, through OpenVINO, which has kernels for it.
+
+ONNX Runtime has none on a CPU. The graph stays one of float: OpenVINO is told to compute it in fp16
+or bf16 when it compiles it, whichever the processor has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.arch import Form, Precision
+from ..model.console import progress
+from ..model.data.scene import Sample
+from ..model.errors import UsageError
+from ..model.graph import GraphHeader
+from ..model.predictor import OnnxPredictor
+from ..profiles.runtimes import precisions
+from .budget import Budget
+from .parity import Measured, measure
+from .race import Duel, Runner, duel, race
+from .source import Source, opened
+
+RUNTIME: Final = "openvino"
+
+
+@dataclass(frozen=True)
+class Halved:
+    """What half precision is worth on this machine."""
+
+    parent: Path
+    """The float graph, in the form that ONNX Runtime runs fastest."""
+    graph: Path
+    """The float graph, in the form that OpenVINO runs fastest at the precision."""
+    header: GraphHeader
+    float_forms: tuple[Form, ...] | None
+    measured: Measured
+    duel: Duel
+    within: bool
+
+    @property
+    def delivered(self) -> bool:
+        """Whether it is faster than fp32 in ONNX Runtime, and within the budget."""
+        return self.within and self.duel.faster
+
+
+class OpenVinoPredictor(OnnxPredictor):
+    """An ONNX graph of one size, computed by OpenVINO at a precision."""
+
+    def __init__(self, path: Path, precision: Precision, threads: int) -> None:
+        from ..profiles.runtimes.ov import Session
+
+        super().__init__(path)
+        self._compiled = Session(path, precision, threads)
+
+    def _answer(self, pair: Mapping[str, NDArray[np.float32]]) -> list[NDArray[Any]]:
+        return self._compiled.answer(self.outputs, pair)
+
+
+def quantize(
+    source: Source, precision: Precision, frames: Sequence[Sample], budget: Budget, threads: int
+) -> Halved:
+    """The network in half precision against fp32 in ONNX Runtime, each in its own faster form.
+
+    Raises:
+        UsageError: the processor has no such precision, or no frame has the truth that judges.
+        Rts2Error: OpenVINO is not installed.
+    """
+    able = precisions(RUNTIME)
+    if precision not in able:
+        others = [each for each in able if each != "fp32"]
+        instead = f"give --precision {others[0]}" if others else "int8 or fp32 remain"
+        raise UsageError(f"this processor does not compute in {precision}; {instead}")
+    graphs = {forms: source.graph(forms or None) for forms in source.forms or ((),)}
+    plain = _fastest([Runner(path, "fp32") for path in graphs.values()], threads)
+    own = _fastest([Runner(path, precision, RUNTIME) for path in graphs.values()], threads)
+    pair = OnnxPredictor(plain.path), OpenVinoPredictor(own.path, precision, threads)
+    shown = progress(frames, "judging", len(frames))
+    measured = measure(*pair, (frame.read() for frame in shown))
+    return Halved(
+        plain.path,
+        own.path,
+        opened(own.path)[1],
+        opened(plain.path)[1].forms,
+        measured,
+        duel(own, plain, threads),
+        budget.holds(measured),
+    )
+
+
+def _fastest(runners: Sequence[Runner], threads: int) -> Runner:
+    ratios = race(runners, threads)
+    return runners[min(range(len(runners)), key=ratios.__getitem__)]
