@@ -30,8 +30,9 @@ from ..model.files import output_file, output_folder, write_json
 from .conformal import half_width
 from .kit import cli as kit_cli
 from .parts import PartModel
-from .profile import Profile, load, names
+from .profile import Profile, Runtime, load, names
 from .runtimes import RUNTIMES
+from .several import FITTED, apart, joined, others, titled
 
 if TYPE_CHECKING:
     from .check import Comparison
@@ -93,14 +94,15 @@ def _parser() -> argparse.ArgumentParser:
     add_output(checked, out=None)
 
     fitted = actions.add_parser("fit", help="time networks on this machine and fit its profile")
-    text = "what the profile starts from: cpu, or a profile whose own points are fitted again"
+    text = (
+        "what the profile starts from: cpu, or a profile of this machine, whose other runtimes "
+        "are kept, or one of published points, which are fitted again"
+    )
     fitted.add_argument("--device", required=True, help=text)
     text = "seconds to spend on timing (default: 300)"
     fitted.add_argument("--budget", type=positive, default=300.0, metavar="SECONDS", help=text)
     text = "what runs the networks: onnxruntime or openvino (default: onnxruntime)"
-    fitted.add_argument(
-        "--runtime", choices=("onnxruntime", "openvino"), default="onnxruntime", help=text
-    )
+    fitted.add_argument("--runtime", choices=FITTED, default=FITTED[0], help=text)
     fitted.add_argument("--out", type=Path, required=True, metavar="FILE", help="the new profile")
     _add_timing(fitted)
     _add_seed(fitted)
@@ -368,42 +370,63 @@ def _fit(options: argparse.Namespace) -> None:
         }
         for known in fitted.calibrations
     ]
+    kept = others(fitted, options.runtime) if template.machine is not None else ()
+    now = [row for row in rows if row["runtime"] not in kept]
     if options.json:
-        first = {name: rows[0][name] for name in ("n", "mape", "max_ape", "within_5", "within_10")}
+        first = {name: now[0][name] for name in ("n", "mape", "max_ape", "within_5", "within_10")}
         result = {"schema": "rts2.profile-fit/1", "file": str(path), **first, "calibrations": rows}
         print_json(result)
         return
-    for row in rows:
+    for row in now:
         _print(
             f"{fitted.title}, {row['precision']} on {row['runtime']}: "
             f"{row['n']} timings, each left out in turn: "
             f"mean error {row['mape']:.1%}, worst {row['max_ape']:.1%}"
         )
+    for runtime in kept:
+        _print(f"kept      what {template.name} tells of {titled(runtime)}")
     _print(f"written   {path}")
 
 
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:
     """Times networks until the budget is spent, going on where an earlier run stopped."""
     from ..model.machine import cores
-    from .measure import Bench, extend, open_journal, profile_of
+    from .measure import Bench, extend, journal_path, open_journal, profile_of
     from .plan import jobs
 
     deadline = monotonic() + options.budget - RESERVE_S
     threads = options.threads or cores()
-    journal_path = path.with_name(f"{path.stem}.timings.json")
-    journal = open_journal(journal_path, options.runtime, threads, options.seed)
+    timings = journal_path(path, options.runtime)
+    journal = open_journal(timings, options.runtime, threads, options.seed)
+    beside = _beside(template, options.runtime, threads)
     bench = Bench(options.runtime, threads)
     remaining = islice(jobs(options.seed, bench.precisions), len(journal.samples), None)
     for job in _until(deadline, remaining, len(journal.samples)):
-        journal = extend(journal, journal_path, bench.harvest(job))
+        journal = extend(journal, timings, bench.harvest(job))
     busy = sum(not sample.reliable for sample in journal.samples)
     if busy > BUSY_SHARE * len(journal.samples):
         _warn(
             f"{busy} of {len(journal.samples)} networks were timed while the machine was busy and "
             "tell little; close what else runs here, delete the timings and fit again"
         )
-    name = re.sub("[^a-z0-9._-]+", "-", path.stem.lower()).strip("._-")
-    return profile_of(journal, template, name or template.name)
+    name = re.sub("[^a-z0-9._-]+", "-", path.stem.lower()).strip("._-") or template.name
+    if beside is None:
+        return profile_of(journal, template, name)
+    assert beside.machine is not None
+    return joined(profile_of(journal, template, name, beside.machine.reference_ms), beside)
+
+
+def _beside(template: Profile, runtime: Runtime, threads: int) -> Profile | None:
+    """`template`, if it is of this machine and of other runtimes too: those are kept."""
+    kept = others(template, runtime)
+    if not kept:
+        return None
+    reason = apart(template, threads)
+    if reason is None:
+        return template
+    known = " and ".join(map(titled, kept))
+    _warn(f"what {template.name} tells of {known} is not kept: {reason}")
+    return None
 
 
 def _until(deadline: float, items: Iterator[Job], timed: int) -> Iterator[Job]:

@@ -33,21 +33,33 @@ def differences(machine: Machine, threads: int) -> list[str]:
 
     No runtime is imported for it.
     """
+    told = (changed(machine, name) for name in sorted(machine.versions))
+    return [*elsewhere(machine, threads), *filter(None, told)]
+
+
+def elsewhere(machine: Machine, threads: int) -> list[str]:
+    """That this is another machine than a profile's, or of other threads; empty where it is not."""
     told = []
     here = processor()
     if here != machine.processor:
         told.append(f"the profile is of {machine.processor}; this is {here}")
     if threads != machine.threads:
         told.append(f"the profile is for {machine.threads} threads, not {threads}")
-    for name, then in sorted(machine.versions.items()):
-        now = _installed(name)
-        if now is not None and _public(now) != _public(then):
-            told.append(f"the profile was fitted with {name} {then}, not {now}")
     return told
 
 
-def _installed(name: str) -> str | None:
-    """The version here, "none" for a package that is missing, None for what is no package."""
+def changed(machine: Machine, name: str) -> str | None:
+    """That a profile was fitted with another version of `name`; None where it was not, or where
+    one of the two is not known.
+    """
+    then, now = machine.versions.get(name), installed(name)
+    if then is None or now is None or _public(now) == _public(then):
+        return None
+    return f"the profile was fitted with {name} {then}, not {now}"
+
+
+def installed(name: str) -> str | None:
+    """A version here, "none" for a package that is missing, None for what is no package."""
     if name == "python":
         return platform.python_version()
     if name not in PACKAGES:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import random
 import weakref
 from collections.abc import Sequence
+from functools import cached_property
 from math import exp, log
 from pathlib import Path
 from shutil import rmtree
 from statistics import median
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -29,12 +30,11 @@ from .profile import (
     Fact,
     Machine,
     Point,
-    PrecisionSupport,
     Profile,
     Resolution,
     Runtime,
-    RuntimeSupport,
 )
+from .several import FITTED, blank, precision_support, runtime_support, titled
 from .timing import Reference, Timing, measure
 
 if TYPE_CHECKING:
@@ -122,15 +122,20 @@ class Bench:
     """Times networks of random weights in one runtime, the reference in between."""
 
     def __init__(self, runtime: Runtime, threads: int) -> None:
-        from .runtimes import open_session, precisions
+        from .runtimes import precisions
 
         self.runtime, self.threads = runtime, threads
         self.precisions = precisions(runtime)
         self._folder = Path(mkdtemp(prefix="rts2."))
         weakref.finalize(self, rmtree, self._folder, ignore_errors=True)
-        reference = self._exported(*REFERENCE, "reference")
-        self._reference = Reference(open_session("onnxruntime", reference, "fp32", threads).run)
         self._last: tuple[Any, ...] | None = None
+
+    @cached_property
+    def _reference(self) -> Reference:
+        from .runtimes import open_session
+
+        path = self._exported(*REFERENCE, "reference")
+        return Reference(open_session("onnxruntime", path, "fp32", self.threads).run)
 
     def time(self, job: Job) -> Timing:
         """One network as a whole, as carefully as can be."""
@@ -172,16 +177,29 @@ class Bench:
         return open_session(self.runtime, path, precision, self.threads)
 
 
+def journal_path(path: Path, runtime: Runtime) -> Path:
+    """Where the timings of a profile at `path` stand, one file a runtime."""
+    of = "" if runtime == FITTED[0] else f".{runtime}"
+    return path.with_name(f"{path.stem}{of}.timings.json")
+
+
 def open_journal(path: Path, runtime: Runtime, threads: int, seed: int) -> Journal:
     """What was timed before on this machine with this seed, or an empty journal.
 
     Raises `Rts2Error` where the journal is of another machine, version, runtime or seed.
     """
-    fresh = Journal(machine=this_machine(runtime, threads), runtime=runtime, seed=seed)
+    from .runtimes import versions
+
+    machine = this_machine(runtime, threads)
+    told = machine.versions | versions("onnxruntime")  # the reference's
+    fresh = Journal(
+        machine=machine.model_copy(update={"versions": told}), runtime=runtime, seed=seed
+    )
     if not path.exists():
         return fresh
     known = read_json(path, Journal, "a journal of timings")
-    same = known.machine.model_copy(update={"date": fresh.machine.date}) == fresh.machine
+    of_another_day = {"date": machine.date, "versions": told | known.machine.versions}
+    same = known.machine.model_copy(update=of_another_day) == fresh.machine
     if not same or (known.seed, known.runtime) != (seed, runtime):
         raise Rts2Error(
             f"{path} holds timings of another machine, version, runtime or seed; "
@@ -197,11 +215,15 @@ def extend(journal: Journal, path: Path, sample: Sample) -> Journal:
     return longer
 
 
-def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
-    """The profile of this machine: `template`'s facts, the journal's timings, tables of parts.
+def profile_of(
+    journal: Journal, template: Profile, name: str, reference_ms: float | None = None
+) -> Profile:
+    """The profile of this machine in one runtime: the facts of `template`'s data sheets, the
+    journal's timings, tables of parts.
 
-    A timing is its ratio to the reference times what the reference usually took. Timings that are
-    not reliable weigh less in the tables, and are neither points of the profile nor in its errors.
+    A timing is its ratio to the reference times `reference_ms`, or else what the reference usually
+    took. Timings that are not reliable weigh less in the tables, and are neither points of the
+    profile nor in its errors.
 
     Raises `Rts2Error` where too few are reliable.
     """
@@ -209,54 +231,40 @@ def profile_of(journal: Journal, template: Profile, name: str) -> Profile:
     if not known:
         raise _too_few(0, NEEDED)
     usual = median(sample.reference_ms for sample in known)
-    machine = journal.machine
-    title = titled(journal.runtime)
-    source = f"{title} on {machine.processor}, {machine.date}"
-    precisions = tuple(dict.fromkeys(sample.precision for sample in journal.samples))
+    speed = Speed(usual, reference_ms or usual)
+    template, machine, runtime = blank(template), journal.machine, journal.runtime
+    version = machine.versions.get(runtime, "not told")
+    source = f"{titled(runtime)} on {machine.processor}, {machine.date}"
     facts = (
         Fact(name="processor", value=machine.processor, source="the operating system"),
         Fact(name="threads", value=str(machine.threads), source="rts2-profile"),
     )
     fitted: list[_Fitted] = []
-    for precision in precisions:
+    for precision in dict.fromkeys(sample.precision for sample in journal.samples):
         samples = [sample for sample in journal.samples if sample.precision == precision]
         like = fitted[0].model if fitted else None
-        fitted.append(_Fitted(samples, journal.runtime, usual, source, like))
+        fitted.append(_Fitted(samples, runtime, speed, source, like))
+    calibrations = tuple(known.calibration() for known in fitted)
     return template.model_copy(
         update={
             "name": name,
             "title": f"CPU ({machine.processor.split(',')[0]}, {machine.threads} threads)",
             "hardware": facts,
-            "precisions": _precisions(template, precisions, title),
-            "runtimes": _runtimes(template, journal),
-            "calibrations": tuple(known.calibration() for known in fitted),
+            "precisions": precision_support(template, calibrations),
+            "runtimes": runtime_support(template, runtime, version),
+            "calibrations": calibrations,
             "derivations": (),
             "points": tuple(point for known in fitted for point in known.points),
-            "machine": machine.model_copy(update={"reference_ms": usual}),
+            "machine": machine.model_copy(update={"reference_ms": speed.told_ms}),
         }
     )
 
 
-def _precisions(
-    template: Profile, timed: tuple[Precision, ...], title: str
-) -> tuple[PrecisionSupport, ...]:
-    """What the template says, but for the precisions that were timed."""
-    told = tuple(
-        PrecisionSupport(
-            precision=precision, supported=True, reason=f"timed in {title}", source="rts2-profile"
-        )
-        for precision in timed
-    )
-    return told + tuple(known for known in template.precisions if known.precision not in timed)
+class Speed(NamedTuple):
+    """What the reference takes, in ms: while the timings were taken, and in the profile."""
 
-
-def _runtimes(template: Profile, journal: Journal) -> tuple[RuntimeSupport, ...]:
-    """The template's, and the one that was timed."""
-    if journal.runtime in {known.runtime for known in template.runtimes}:
-        return template.runtimes
-    version = journal.machine.versions.get(journal.runtime, "not told")
-    timed = RuntimeSupport(runtime=journal.runtime, version=version, source="rts2-profile")
-    return (*template.runtimes, timed)
+    usual_ms: float
+    told_ms: float
 
 
 class _Fitted:
@@ -269,7 +277,7 @@ class _Fitted:
         self,
         samples: Sequence[Sample],
         runtime: Runtime,
-        usual_ms: float,
+        speed: Speed,
         source: str,
         like: PartModel | None,
     ) -> None:
@@ -280,7 +288,7 @@ class _Fitted:
         if len(self._reliable) < needed:
             raise _too_few(len(self._reliable), needed)
         self._source = source
-        seen = [_harvest(sample, usual_ms) for sample in samples]
+        seen = [_harvest(sample, speed) for sample in samples]
         power = damping(seen, like)
         self._like = like
         self._harvests = [_undrifted(harvest, power) for harvest in seen]
@@ -313,10 +321,10 @@ def _asked() -> list[Candidate]:
     return [random_candidate(chance) for _ in range(ASKED)]
 
 
-def _harvest(sample: Sample, usual_ms: float) -> Harvest:
-    scale = sample.ratio * usual_ms / sample.latency_ms
+def _harvest(sample: Sample, speed: Speed) -> Harvest:
+    scale = sample.ratio * speed.told_ms / sample.latency_ms
     parts_ms = {part: ms * scale for part, ms in sample.parts_ms.items()}
-    drift = 0.0 if sample.reliable else log(sample.reference_ms / usual_ms)
+    drift = 0.0 if sample.reliable else log(sample.reference_ms / speed.usual_ms)
     return Harvest(sample.arch, sample.resolution, parts_ms, sample.error, drift, sample.forms)
 
 
@@ -346,10 +354,3 @@ def _too_few(count: int, needed: int) -> Rts2Error:
         f"{count} reliable timings are too few for tables of parts, which need {needed}; "
         "the same command with a longer --budget goes on from here"
     )
-
-
-def titled(runtime: str) -> str:
-    """A runtime's own name."""
-    from .runtimes import RUNTIMES
-
-    return RUNTIMES[runtime].title

@@ -199,7 +199,9 @@ class Machine(Frozen):
     threads: Annotated[int, Field(ge=1)]
     system: str
     versions: dict[str, str]
+    """Of all runtimes that the profile was timed in."""
     date: str
+    """Of the first fit that still counts: what was timed since stands at its reference's speed."""
     reference_ms: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """What the reference network took then: how a later day's drift is told."""
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from importlib.util import find_spec
+from dataclasses import replace
 from itertools import islice
 from math import prod
 from pathlib import Path
@@ -21,13 +21,13 @@ from rts2.model.arch import UNTRAINED, Arch
 from rts2.model.checkpoint import build
 from rts2.model.export import export
 from rts2.model.files import write_json
-from rts2.profiles import cli, measure, timing
+from rts2.profiles import cli, here, measure, timing
 from rts2.profiles.calibrate import leave_one_out
 from rts2.profiles.cli import profile
 from rts2.profiles.parts import AXES, PartModel
 from rts2.profiles.plan import Job, jobs
 from rts2.profiles.profile import Profile, load, names
-from rts2.profiles.runtimes import ov
+from rts2.profiles.runtimes import RUNTIMES, ov
 from rts2.profiles.timing import Timing
 
 
@@ -386,19 +386,68 @@ def test_a_budget_without_a_single_timing_is_one_line(
 
 
 @pytest.mark.usefixtures("made_up")
-def test_fit_refuses_timings_of_another_seed_or_runtime_and_keeps_them(
+def test_fit_refuses_timings_of_another_seed_or_threads_and_keeps_them(
     run: Any, tmp_path: Path
 ) -> None:
     path = tmp_path / "x.json"
     asked = ("fit", "--device", "cpu", "--threads", 1, "--out", path, "--budget", 3)
     run(*asked)
     journal = (tmp_path / "x.timings.json").read_bytes()
-    others: list[tuple[object, ...]] = [("--seed", 1), ("--threads", 2)]
-    if find_spec("openvino"):
-        others.append(("--runtime", "openvino"))
-    for other in others:
+    for other in (("--seed", 1), ("--threads", 2)):
         refused(run(*asked, *other), 1, "another machine, version, runtime or seed")
     assert (tmp_path / "x.timings.json").read_bytes() == journal
+
+
+@pytest.fixture
+def openvino_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if OpenVINO were installed, whether it is or not; the made-up machine needs none."""
+    told = {"openvino": here.installed("openvino") or "none"}
+    row = replace(RUNTIMES["openvino"], missing=lambda: None, versions=lambda: told)
+    monkeypatch.setitem(RUNTIMES, "openvino", row)
+
+
+@pytest.fixture
+def both(device: Path, run: Any, made_up: Any, openvino_here: None, tmp_path: Path) -> Path:
+    """The made-up machine's profile in ONNX Runtime, and fitted in OpenVINO beside it."""
+    path = tmp_path / "both.json"
+    asked = ("fit", "--device", device, "--threads", 2, "--runtime", "openvino", "--budget", 24)
+    assert run(*asked, "--out", path).code == 0
+    return path
+
+
+def test_a_second_runtime_is_fitted_beside_the_first(run: Any, both: Path, device: Path) -> None:
+    first, found = load(str(device)), load(str(both))
+    assert [c.runtime for c in found.calibrations] == ["onnxruntime", "openvino"]
+    assert found.calibrations[0] == first.calibrations[0]
+    assert (both.parent / "both.openvino.timings.json").exists()
+    asked = ("fit", "--device", both, "--out", both, "--threads", 2, "--runtime", "openvino")
+    told = run(*asked, "--budget", 1, "--json").json
+    assert (told["n"], [row["n"] for row in told["calibrations"]]) == (25, [24, 25])
+    shown = run(*asked, "--budget", 1)
+    assert (shown.code, shown.err) == (0, "")
+    assert "fp32 on openvino: 26 timings" in shown.out
+    assert "kept      what both tells of ONNX Runtime" in shown.out
+    assert "on onnxruntime" not in shown.out
+    assert load(str(both)).calibrations[0] == first.calibrations[0]
+
+
+@pytest.mark.usefixtures("made_up", "openvino_here")
+def test_what_is_of_other_threads_is_not_kept_and_told(
+    run: Any, device: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.json"
+    asked = ("fit", "--device", device, "--threads", 1, "--runtime", "openvino", "--budget", 24)
+    found = run(*asked, "--out", path)
+    assert found.code == 0
+    assert found.err == (
+        "note: what made-up tells of ONNX Runtime is not kept: "
+        "the profile is for 2 threads, not 1\n"
+    )
+    assert [c.runtime for c in load(str(path)).calibrations] == ["openvino"]
+    again = run("fit", "--device", path, "--threads", 2, "--budget", 24, "--out", path)
+    assert "note: what x tells of OpenVINO is not kept: the profile is for 1 threads" in again.err
+    assert [c.runtime for c in load(str(path)).calibrations] == ["onnxruntime"]
+    assert load(str(path)).refusal("fp16") is not None
 
 
 def test_fit_in_a_runtime_that_is_missing_names_its_extra(
