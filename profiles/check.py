@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import exp, log
 from typing import Any
@@ -20,6 +20,11 @@ from .profile import Profile, Resolution, Runtime
 CHECK_SEED = 1_000_003
 """Fresh networks are drawn from another stream than those that a fit is made of."""
 
+Executor = tuple[Runtime, Precision]
+
+Benches = Callable[[Runtime], Bench]
+"""The bench of a runtime; asked again it gives the same one."""
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -35,6 +40,10 @@ class Comparison:
     """How much slower the machine ran than when the profile was made; divided out of `fps_true`."""
     reliable: bool = True
     """Whether the runs agreed; no error is told of a timing that is not."""
+
+    @property
+    def executor(self) -> Executor:
+        return self.runtime, self.precision
 
     @property
     def residual(self) -> float:
@@ -85,23 +94,56 @@ RETRIES = 2
 """How often a network is timed again, after all the others, while its timing is unreliable."""
 
 
-def fresh(profile: Profile, bench: Bench, samples: int, seed: int) -> Iterator[Comparison]:
-    """Random networks that no fit has seen, timed on this machine now, in all of the profile's
-    precisions; those whose timing is unreliable come last, timed again.
+def executors_here(profile: Profile, benches: Benches) -> tuple[list[Executor], list[str]]:
+    """What of the profile can be timed on this machine, and why the rest cannot, a line each.
+
+    Raises `Rts2Error` where nothing can.
+    """
+    from .runtimes import RUNTIMES
+
+    able: list[Executor] = []
+    told: dict[str, None] = {}
+    for known in profile.calibrations:
+        row = RUNTIMES.get(known.runtime)
+        title = row.title if row else known.runtime
+        reason = row.missing() if row else f"no network can be timed in {title}"
+        if reason is None and known.precision not in benches(known.runtime).precisions:
+            reason = f"{title} does not run {known.precision} on this machine"
+        if reason is None:
+            able.append((known.runtime, known.precision))
+        else:
+            told[reason] = None
+    if not able:
+        raise Rts2Error(f"nothing of {profile.title} can be timed here: {next(iter(told))}")
+    return able, list(told)
+
+
+def fresh(
+    profile: Profile,
+    benches: Benches,
+    executors: Sequence[Executor],
+    samples: int,
+    seed: int,
+) -> Iterator[Comparison]:
+    """Random networks that no fit has seen, timed on this machine now, each in one of `executors`;
+    those whose timing is unreliable come last, timed again.
 
     What counts is the ratio to the reference beside it: a machine drifts from day to day.
     """
     chance = random.Random(CHECK_SEED + seed)
-    precisions = [c.precision for c in profile.calibrations if c.runtime == bench.runtime]
-    drawn = [Job(*random_candidate(chance), chance.choice(precisions)) for _ in range(samples)]
+    drawn: list[tuple[Runtime, Job]] = []
+    for _ in range(samples):
+        candidate = random_candidate(chance)
+        runtime, precision = chance.choice(executors)
+        drawn.append((runtime, Job(*candidate, precision)))
     for left in range(RETRIES, -1, -1):
         again = []
-        for job in drawn:
-            found = _compared(profile, bench, job)
+        for runtime, job in drawn:
+            found = _compared(profile, benches(runtime), job)
             if found.reliable or not left:
                 yield found
             else:
-                again.append(job)
+                again.append((runtime, job))
         drawn = again
 
 
@@ -124,13 +166,18 @@ def _compared(profile: Profile, bench: Bench, job: Job) -> Comparison:
     )
 
 
-def coverage(profile: Profile, comparisons: Sequence[Comparison], confidence: float) -> float:
-    """The share of reliable timings within the interval that the profile gives at a confidence."""
-    widths = {
+def half_widths(profile: Profile, confidence: float) -> dict[Executor, float]:
+    """Of the interval that each calibration gives at a confidence, in natural logarithm."""
+    return {
         (known.runtime, known.precision): half_width(known.residuals, confidence)
         for known in profile.calibrations
     }
-    inside = [abs(c.residual) <= widths[c.runtime, c.precision] for c in comparisons if c.reliable]
+
+
+def coverage(profile: Profile, comparisons: Sequence[Comparison], confidence: float) -> float:
+    """The share of reliable timings within the interval that the profile gives at a confidence."""
+    widths = half_widths(profile, confidence)
+    inside = [abs(c.residual) <= widths[c.executor] for c in comparisons if c.reliable]
     return sum(inside) / len(inside)
 
 

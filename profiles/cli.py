@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from statistics import median
@@ -35,9 +36,8 @@ from .runtimes import RUNTIMES
 from .several import FITTED, apart, joined, others, titled
 
 if TYPE_CHECKING:
-    from .check import Comparison
+    from .check import Benches, Comparison
     from .latency import LatencyModel
-    from .measure import Bench
     from .plan import Job
 
 CONFIDENCE = 0.9
@@ -256,12 +256,15 @@ def _timed_now(
     options: argparse.Namespace, known: Profile
 ) -> tuple[list[Comparison], dict[str, Any]]:
     """Networks that no fit has seen, timed on this machine."""
-    from .check import coverage, fresh, report
+    from .check import coverage, executors_here, fresh, report
 
-    bench = _bench(options, known)
+    benches = _benches(options, known)
     if options.out is not None:
         output_folder(options.out)  # before minutes are spent on timing
-    timed = fresh(known, bench, options.samples, options.seed)
+    executors, skipped = executors_here(known, benches)
+    for reason in skipped:
+        _warn(f"not timed: {reason}")
+    timed = fresh(known, benches, executors, options.samples, options.seed)
     comparisons = list(progress(timed, "timing", options.samples))
     reliable = [comparison for comparison in comparisons if comparison.reliable]
     result = report(known, comparisons)
@@ -320,17 +323,17 @@ def _write_check(
     out: Path, known: Profile, comparisons: Sequence[Comparison], result: dict[str, Any]
 ) -> None:
     """The check as JSON and as a picture."""
+    from .check import half_widths
     from .plot import save
 
     folder = output_folder(out)
     reliable = [comparison for comparison in comparisons if comparison.reliable]
-    width = half_width(known.calibrations[0].residuals, CONFIDENCE)
     write_json(folder / "check.json", result)
-    save(reliable, known.title, width, folder / "check.png")
+    save(reliable, known.title, half_widths(known, CONFIDENCE), folder / "check.png")
 
 
-def _bench(options: argparse.Namespace, known: Profile) -> Bench:
-    """A bench on this machine, if the profile is one of a machine at hand."""
+def _benches(options: argparse.Namespace, known: Profile) -> Benches:
+    """A bench for each runtime on this machine, if the profile is one of a machine at hand."""
     from .here import differences
     from .measure import Bench
 
@@ -338,11 +341,10 @@ def _bench(options: argparse.Namespace, known: Profile) -> Bench:
         raise UsageError(
             f"{known.title} is not this machine; without --samples its points are left out in turn"
         )
-    runtime = known.calibrations[0].runtime
     threads = options.threads or known.machine.threads
     for difference in differences(known.machine, threads):
         _warn(difference)
-    return Bench(runtime, threads)
+    return cache(lambda runtime: Bench(runtime, threads))
 
 
 def _warn(text: str) -> None:

@@ -1,6 +1,7 @@
 """How well a profile predicts: against points left out, and against a machine that is made up."""
 
 import warnings
+from dataclasses import replace
 from itertools import islice
 from math import exp, log
 from typing import Any
@@ -11,10 +12,19 @@ import pytest
 from rts2.model.arch import Arch
 from rts2.model.errors import Rts2Error
 from rts2.profiles.calibrate import fit, leave_one_out, recalibrated
-from rts2.profiles.check import Comparison, coverage, fresh, held_out, report
+from rts2.profiles.check import (
+    Comparison,
+    coverage,
+    executors_here,
+    fresh,
+    half_widths,
+    held_out,
+    report,
+)
 from rts2.profiles.latency import predict_ms
 from rts2.profiles.plan import jobs
 from rts2.profiles.profile import Profile, load
+from rts2.profiles.runtimes import RUNTIMES
 from rts2.search.space import Space
 
 KEYS = [
@@ -148,10 +158,22 @@ def test_each_precision_is_covered_by_its_own_interval(exact: Profile) -> None:
         for precision in ("fp32", "bf16")
     ]
     assert [coverage(both, [pair], 0.9) for pair in pairs] == [0, 1]
+    # The 23rd smallest of 24.
+    assert half_widths(both, 0.9) == {
+        ("onnxruntime", "fp32"): pytest.approx(0.12),
+        ("onnxruntime", "bf16"): pytest.approx(1.2),
+    }
 
 
-def checked(profile: Profile, bench: Any, samples: int = 5, seed: int = 0) -> list[Comparison]:
-    return list(fresh(profile, bench, samples, seed))
+def checked(profile: Profile, *benches: Any, samples: int = 5, seed: int = 0) -> list[Comparison]:
+    """In all that the benches run of the profile."""
+    by_runtime = {bench.runtime: bench for bench in benches}
+    executors = [
+        (known.runtime, known.precision)
+        for known in profile.calibrations
+        if known.runtime in by_runtime and known.precision in by_runtime[known.runtime].precisions
+    ]
+    return list(fresh(profile, by_runtime.__getitem__, executors, samples, seed))
 
 
 def test_fresh_networks_are_judged_by_the_profile_that_claims_them(
@@ -184,26 +206,78 @@ def test_runs_that_disagree_are_marked(exact: Profile, planted: Any) -> None:
     assert not any(c.reliable for c in checked(exact, bench))
 
 
-def test_fresh_networks_come_in_every_precision_of_the_runtime(
-    exact: Profile, planted: Any
-) -> None:
-    """Not in those that another runtime of the profile has."""
+def several(exact: Profile) -> Profile:
+    """In three precisions on two runtimes; all as fast as the first, so the others' are wrong."""
     (known,) = exact.calibrations
     more = [
-        known.model_copy(update={"precision": "bf16"}),
-        known.model_copy(update={"precision": "fp16", "runtime": "tensorrt"}),
+        known.model_copy(update={"runtime": "openvino"}),
+        known.model_copy(update={"precision": "bf16", "runtime": "openvino"}),
     ]
-    both = exact.model_copy(update={"calibrations": (known, *more)})
-    found = checked(both, planted(), 40)
-    assert {c.precision for c in found} == {"fp32", "bf16"}
-    for comparison in found:  # bf16 takes 0.6 of what is predicted
-        wanted = 0.0 if comparison.precision == "fp32" else log(0.6)
-        assert comparison.residual == pytest.approx(wanted)
+    return exact.model_copy(update={"calibrations": (known, *more)})
+
+
+def test_fresh_networks_come_in_every_precision_of_every_runtime(
+    exact: Profile, planted: Any
+) -> None:
+    """Each is timed on the bench of its runtime; of 60 draws none of three is missed by chance."""
+    one, other = planted(), planted("openvino")
+    other.precisions, other.factor = ("fp32", "bf16"), 0.5
+    found = checked(several(exact), one, other, samples=60)
+    wanted = {
+        ("onnxruntime", "fp32"): 0.0,
+        ("openvino", "fp32"): log(0.5),
+        ("openvino", "bf16"): log(0.5 * 0.6),
+    }
+    assert {c.executor for c in found} == wanted.keys()
+    for comparison in found:
+        assert comparison.residual == pytest.approx(wanted[comparison.executor])
+    assert len(one.timed) == sum(c.runtime == "onnxruntime" for c in found)
+    assert {job.precision for job in one.timed} == {"fp32"}
+
+
+def test_fresh_networks_come_in_what_was_asked_for_alone(exact: Profile, planted: Any) -> None:
+    found = checked(several(exact), planted(), samples=20)
+    assert {c.executor for c in found} == {("onnxruntime", "fp32")}
+
+
+def runtimes_here(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """As if these runtimes, and no others, were installed."""
+    for name, row in RUNTIMES.items():
+        missing = None if name in names else f"{row.title} is not installed"
+        able = replace(row, missing=lambda missing=missing: missing)
+        monkeypatch.setitem(RUNTIMES, name, able)
+
+
+def test_what_cannot_be_timed_here_is_told_once_and_no_bench_of_it_opened(
+    exact: Profile, planted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtimes_here(monkeypatch, "onnxruntime")
+    able, told = executors_here(several(exact), {"onnxruntime": planted()}.__getitem__)
+    assert able == [("onnxruntime", "fp32")]
+    assert told == ["OpenVINO is not installed"]
+
+
+def test_a_precision_that_the_processor_lacks_is_told(
+    exact: Profile, planted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtimes_here(monkeypatch, "onnxruntime", "openvino")
+    able, told = executors_here(several(exact), planted)
+    assert able == [("onnxruntime", "fp32"), ("openvino", "fp32")]
+    assert told == ["OpenVINO does not run bf16 on this machine"]
+
+
+def test_where_nothing_can_be_timed_the_error_says_why(
+    exact: Profile, planted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtimes_here(monkeypatch)
+    with pytest.raises(Rts2Error, match=r"can be timed here: ONNX Runtime is not") as error:
+        executors_here(several(exact), planted)
+    assert "\n" not in str(error.value)
 
 
 def test_fresh_networks_are_none_that_a_fit_was_made_of(exact: Profile, planted: Any) -> None:
     bench = planted()
-    checked(exact, bench, 40)
+    checked(exact, bench, samples=40)
     assert all(Space().position(job.arch) is not None for job in bench.timed)
     for seed in (0, 1):
         assert not set(bench.timed) & set(islice(jobs(seed, ("fp32",)), 12, 400))
@@ -212,7 +286,7 @@ def test_fresh_networks_are_none_that_a_fit_was_made_of(exact: Profile, planted:
 def test_fresh_networks_depend_on_the_seed_alone(exact: Profile, planted: Any) -> None:
     benches = [planted() for _ in range(3)]
     for bench, seed in zip(benches, (0, 0, 1), strict=True):
-        checked(exact, bench, 10, seed)
+        checked(exact, bench, samples=10, seed=seed)
     same, again, other = (bench.timed for bench in benches)
     assert same == again
     assert not set(same) & set(other)
@@ -232,7 +306,7 @@ def test_fresh_networks_run_in_the_forms_that_the_profile_takes_for_the_fastest(
 ) -> None:
     """On the made-up machine that is banded up to seven planes: always from the second stage on."""
     bench = planted()
-    found = checked(exact, bench, 40)
+    found = checked(exact, bench, samples=40)
     for job in bench.timed:
         expected = ("banded" if job.arch.d_max <= 7 else "3d", "banded", "banded")
         assert job.forms == expected[: job.arch.stages]

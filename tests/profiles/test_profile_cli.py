@@ -450,6 +450,28 @@ def test_what_is_of_other_threads_is_not_kept_and_told(
     assert load(str(path)).refusal("fp16") is not None
 
 
+@pytest.mark.usefixtures("made_up")
+def test_two_runtimes_are_checked_side_by_side(run: Any, both: Path, tmp_path: Path) -> None:
+    out = tmp_path / "check"
+    asked = ("check", "--device", both, "--samples", 12, "--threads", 2)
+    found = run(*asked, "--json", "--out", out)
+    told = json.loads(found.out)
+    assert {point["runtime"] for point in told["points"]} == {"onnxruntime", "openvino"}
+    assert told == json.loads((out / "check.json").read_text())
+    assert (out / "check.png").stat().st_size > 10_000
+
+
+def test_a_runtime_that_is_missing_is_skipped_with_a_note(
+    run: Any, both: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = replace(RUNTIMES["openvino"], missing=lambda: "OpenVINO is not installed; pip brings it")
+    monkeypatch.setitem(RUNTIMES, "openvino", row)
+    found = run("check", "--device", both, "--samples", 6, "--threads", 2, "--json")
+    assert "note: not timed: OpenVINO is not installed; pip brings it\n" in found.err
+    points = json.loads(found.out)["points"]
+    assert [point["runtime"] for point in points] == ["onnxruntime"] * 6
+
+
 def test_fit_in_a_runtime_that_is_missing_names_its_extra(
     run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
