@@ -182,7 +182,7 @@ def deploy(arguments: Sequence[str] | None = None) -> int:
     for line in (
         what,
         f"written   {options.out}/  {names}",
-        f"next      on the device: {next_step(profile)}",
+        f"next      on the device: {next_step(complete.runtime)}",
     ):
         screen().print(line, soft_wrap=True)
     return 0

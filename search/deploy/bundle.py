@@ -6,7 +6,7 @@ configuration, sample, check) is the same for all.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -19,7 +19,7 @@ from ...model.arch import UNTRAINED, Precision
 from ...model.errors import Rts2Error, UsageError
 from ...model.files import write_bytes, write_json
 from ...profiles.opset import refuse_operators
-from ...profiles.profile import Profile, RuntimeSupport
+from ...profiles.profile import Profile, Runtime, RuntimeSupport
 from ...profiles.trtexec import PATH, WORKSPACE_MB
 from .configuration import Check, Deployment, describe, read
 
@@ -42,10 +42,9 @@ class Target:
 
     measured: str
     """The script that runs the sample there, among the files beside this one."""
-    tolerance_px: float
-    """What the runtime may differ from the sample's expected disparity, on average."""
-    precisions: tuple[Precision, ...]
-    """What it makes of a float graph."""
+    tolerance_px: Mapping[Precision, float]
+    """What it makes of a float graph, and how far each may be from the sample's expected disparity,
+    on average."""
     build: Callable[[Deployment], str] | None = None
     """The script that builds an engine there."""
 
@@ -69,26 +68,27 @@ python3 check.py
 
 
 TARGETS: dict[str, Target] = {
-    "onnxruntime": Target("measured_onnxruntime.py", 0.01, ("fp32",)),
-    "tensorrt": Target(
-        "measured_tensorrt.py", tolerance_px=0.1, precisions=("fp32", "fp16"), build=trtexec
-    ),
+    "onnxruntime": Target("measured_onnxruntime.py", {"fp32": 0.01}),
+    "openvino": Target("measured_openvino.py", {"fp32": 0.01, "bf16": 1.0, "fp16": 0.1}),
+    "tensorrt": Target("measured_tensorrt.py", {"fp32": 0.1, "fp16": 0.1}, build=trtexec),
 }
-"""How a bundle runs, by runtime. Half precision is what TensorRT's tolerance allows for."""
+"""How a bundle runs, by runtime. Beside half precision, TensorRT's tolerance allows for TF32; of a
+disparity above 128 pixels the last bit of bf16 is a pixel."""
 
 
-def runtime_of(profile: Profile) -> RuntimeSupport:
-    """The runtime that a bundle for the device is made for.
+def runtime_of(profile: Profile, asked: Runtime | None = None) -> RuntimeSupport:
+    """The runtime that a bundle for the device is made for: what was asked for where a bundle can
+    be, else the first of the device's that one can be made for.
 
     Raises `UsageError` where rts2 delivers to none of the device's runtimes.
     """
-    for support in profile.runtimes:
-        if support.runtime in TARGETS:
-            return support
-    raise UsageError(
-        f"{profile.title} has no runtime that a bundle can be made for; "
-        f"those are {', '.join(TARGETS)}"
-    )
+    able = [support for support in profile.runtimes if support.runtime in TARGETS]
+    if not able:
+        raise UsageError(
+            f"{profile.title} has no runtime that a bundle can be made for; "
+            f"those are {', '.join(TARGETS)}"
+        )
+    return next((support for support in able if support.runtime == asked), able[0])
 
 
 def write(
@@ -101,11 +101,11 @@ def write(
         Rts2Error: the graph has operators that the device's runtime does not take, or its
             output is not the network's.
     """
-    support = runtime_of(profile)
+    support = runtime_of(profile, deployment.runtime)
     target = TARGETS[support.runtime]
-    if deployment.precision not in target.precisions:
+    if deployment.precision not in target.tolerance_px:
         raise UsageError(
-            f"a bundle for {profile.title} runs {' or '.join(target.precisions)} on "
+            f"a bundle for {profile.title} runs {' or '.join(target.tolerance_px)} on "
             f"{support.runtime}, not {deployment.precision}"
         )
     model = folder / MODEL
@@ -129,7 +129,7 @@ def write(
     complete = deployment.model_copy(
         update={
             "files": tuple(describe(path) for path in sorted(written)),
-            "check": Check(tolerance_px=target.tolerance_px),
+            "check": Check(tolerance_px=target.tolerance_px[deployment.precision]),
         }
     )
     write_json(folder / "deployment.json", complete.model_dump(mode="json", by_alias=True))
@@ -198,10 +198,9 @@ def _warning(deployment: Deployment) -> str:
     return "Accuracies in `deployment.json` are those of the search's source, not of these weights."
 
 
-def next_step(profile: Profile) -> str:
-    """The command that builds and checks the bundle on the device."""
-    target = TARGETS[runtime_of(profile).runtime]
-    return "python3 check.py" if target.build is None else "sh build.sh"
+def next_step(runtime: Runtime) -> str:
+    """The command that builds and checks a bundle of a runtime on the device."""
+    return "python3 check.py" if TARGETS[runtime].build is None else "sh build.sh"
 
 
 def _text(name: str) -> str:
@@ -228,7 +227,7 @@ def _readme(deployment: Deployment, profile: Profile, support: RuntimeSupport) -
 {promise}
 Weights: {deployment.weights}. {_warning(deployment)}
 
-    {next_step(profile)}
+    {next_step(support.runtime)}
 
 runs the sample pair through the network on this device, compares the disparity with what is
 expected, and prints the measured frame rate beside the promised one. `deployment.json` says how

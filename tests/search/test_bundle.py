@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.graph import read_header
 from rts2.profiles import opset
 from rts2.profiles.opset import load_opset, operators, refuse_operators
-from rts2.profiles.profile import Profile, Runtime, load
+from rts2.profiles.profile import Profile, Runtime, RuntimeSupport, load
 from rts2.search.deploy.bundle import next_step, runtime_of, trtexec, write
 from rts2.search.deploy.configuration import Deployment, of_point, read
 from rts2.search.result import Coverage, Found, Point, PointEvidence
@@ -107,13 +108,23 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def checked(folder: Path) -> subprocess.CompletedProcess[str]:
-    """check.py as the target runs it: from elsewhere, and without rts2 on the path."""
+def checked(
+    folder: Path, instead: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """check.py as the target runs it: from elsewhere, and without rts2 on the path.
+
+    `instead` has the text of modules that stand in for those which are installed.
+    """
+    modules = folder.parent / "instead"
+    modules.mkdir(exist_ok=True)
+    for name, text in (instead or {}).items():
+        (modules / f"{name}.py").write_text(text)
     ended = subprocess.run(
         [sys.executable, str(folder / "check.py")],
         capture_output=True,
         text=True,
         cwd=folder.parent,
+        env=os.environ | {"PYTHONPATH": str(modules)},
         check=False,
     )
     assert "Traceback" not in ended.stderr, ended.stderr
@@ -153,7 +164,7 @@ def test_the_configuration_promises_with_an_interval_and_its_evidence(
     assert expected.confidence == 0.9
     readme = (bundles[device] / "README.md").read_text(encoding="utf-8")
     assert "25.0 FPS (21.5 to 29.0 at 90%), extrapolated" in readme
-    assert next_step(load(device)) in readme
+    assert next_step(deployment.runtime) in readme
     assert "random" in readme
     # The speed of PyTorch is promised, and TensorRT is what runs: said, not hidden.
     assert ("for pytorch; what is built here runs on tensorrt" in readme) == (device == "rtx2080ti")
@@ -260,6 +271,85 @@ def test_the_check_passes_and_prints_both_frame_rates(copied: dict[str, Path]) -
     assert told["expected"] == ["25.0", "FPS", "(21.5", "to", "29.0)", "on", "onnxruntime"]
     assert float(told["disparity"][0]) < 1e-3
     assert lines[-1] == ["ok"]
+
+
+def beside(profile: Profile, *runtimes: Runtime) -> Profile:
+    """The profile with more runtimes, as a fit writes them."""
+    more = [
+        RuntimeSupport(runtime=name, version="2026.3", source="rts2-profile") for name in runtimes
+    ]
+    return profile.model_copy(update={"runtimes": (*profile.runtimes, *more)})
+
+
+def test_a_bundle_is_made_for_the_runtime_that_was_asked_for_where_one_can_be() -> None:
+    both = beside(load("cpu"), "openvino")
+    assert runtime_of(both).runtime == "onnxruntime"
+    for runtime in ("onnxruntime", "openvino"):
+        assert runtime_of(both, runtime).runtime == runtime
+    assert runtime_of(load("cpu"), "openvino").runtime == "onnxruntime"
+    assert runtime_of(load("tx2"), "pytorch").runtime == "tensorrt"
+
+
+def for_openvino(folder: Path, precision: Precision) -> Path:
+    profile = beside(load("cpu"), "openvino")
+    torch.manual_seed(0)
+    write(build(SMALL), asked(profile, "openvino", precision), profile, "untrained", folder)
+    return folder
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16", "fp16"])
+def test_a_bundle_for_openvino_names_its_precision(tmp_path: Path, precision: Precision) -> None:
+    deployment = read(for_openvino(tmp_path, precision) / "deployment.json")
+    assert (deployment.runtime, deployment.precision) == ("openvino", precision)
+    assert names(tmp_path) == ALWAYS | {"deployment.json"}
+    assert "what is built here runs on" not in (tmp_path / "README.md").read_text()
+
+
+def test_openvino_answers_and_is_timed_in_every_precision_of_the_processor(tmp_path: Path) -> None:
+    pytest.importorskip("openvino", reason="needs OpenVINO: pip install 'rts2[openvino]' brings it")
+    from rts2.profiles.runtimes import ov
+
+    for precision in ov.precisions("fp32"):
+        folder = tmp_path / precision
+        folder.mkdir()
+        ended = checked(for_openvino(folder, precision))
+        assert (ended.returncode, ended.stderr) == (0, "")
+        told = {line.split()[0]: line.split()[1:] for line in ended.stdout.splitlines()}
+        assert told["runtime"][::2] == ["openvino", ov.HINTS[precision]]
+        assert float(told["measured"][0]) > 0
+        assert told["expected"][-1] == "openvino"
+        assert float(told["disparity"][0]) < (1e-3 if precision == "fp32" else 1)
+
+
+@pytest.mark.parametrize("missing", ["openvino", "fp16"])
+def test_what_openvino_needs_on_the_target_is_one_line(tmp_path: Path, missing: str) -> None:
+    """No OpenVINO, or one that computes in another precision than was asked for."""
+    folder = tmp_path / "bundle"
+    folder.mkdir()
+    for_openvino(folder, "fp16")
+    standin = "raise ImportError" if missing == "openvino" else OTHER_PRECISION
+    ended = checked(folder, instead={"openvino": standin})
+    said = {
+        "openvino": "openvino is missing: python3 -m pip install openvino brings it\n",
+        "fp16": "OpenVINO computes in bf16 on this processor, not in f16\n",
+    }
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", said[missing])
+
+
+OTHER_PRECISION = """
+class Core:
+    def compile_model(self, path, device, settings):
+        assert settings["INFERENCE_PRECISION_HINT"] == "f16"
+        return self
+
+    def get_property(self, name):
+        assert name == "INFERENCE_PRECISION_HINT"
+        return self
+
+    def get_type_name(self):
+        return "bf16"
+"""
+"""An OpenVINO that takes bf16 whatever it was told."""
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -405,7 +495,8 @@ def test_the_scripts_are_python_3_6(script: str) -> None:
         name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names
     }
     assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    extra = {"numpy", "onnxruntime"} if script == "measured_onnxruntime.py" else set()
+    runtime = script.removeprefix("measured_").removesuffix(".py")
+    extra = {"numpy", runtime} if runtime in ("onnxruntime", "openvino") else set()
     assert imported <= set(sys.stdlib_module_names) | {"measured"} | extra
 
 
