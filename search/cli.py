@@ -65,8 +65,10 @@ def _warn_of_differences(profile: Profile, device: str) -> None:
     for difference in told:
         logging.getLogger(__name__).warning("note: %s", difference)
     if told:
-        text = "note: rts2-profile fit --device %s --out FILE.json times this machine as it is"
-        logging.getLogger(__name__).warning(text, device)
+        text = "note: rts2-profile fit --device %s --out FILE.json times this machine as it is%s"
+        runtimes = list(dict.fromkeys(known.runtime for known in profile.calibrations))
+        each = f", once with each --runtime: {', '.join(runtimes)}" if len(runtimes) > 1 else ""
+        logging.getLogger(__name__).warning(text, device, each)
 
 
 def _search_parser() -> argparse.ArgumentParser:

@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from ..model.files import replacing
 from ..profiles.evidence import Evidence
 from .accuracy import LOWER_IS_BETTER
-from .report import AXIS, RUNTIMES, caption, headline
+from .report import AXIS, caption, executor_of, headline
 from .result import Found, Point
 
 INK, PALE, ACCENT, PROMISE = "#1f2933", "#9aa5b1", "#c2410c", "#1d6fa5"
+COLOURS = (INK, "#2e7d6b", "#8b5fbf", "#b58900", "#5b7fa6", "#a0526d")
+"""One for each runtime and precision of the proven points, where there are several."""
 MARKERS: dict[Evidence, str] = {
     "published": "s",
     "measured": "D",
@@ -66,33 +68,50 @@ def _only_latency(point: Point) -> bool:
 
 
 def _series(axes: Axes, found: Found, points: Sequence[Point], color: str) -> None:
-    """One line of points with their intervals, a marker for each evidence."""
+    """One line of points with their intervals, a marker for each evidence of the latency.
+
+    Proven points of several runtimes or precisions have a colour for each.
+    """
     drawn = [(point, y) for point in points if (y := point.metric(found.objective)) is not None]
     if not drawn:
         return
     axes.plot([p.fps for p, _ in drawn], [y for _, y in drawn], color=color, alpha=0.25, zorder=1)
-    for evidence, marker in MARKERS.items():
-        group = [(point, y) for point, y in drawn if point.evidence.latency == evidence]
-        if not group:
-            continue
-        fps = [point.fps for point, _ in group]
-        spread = (
-            [point.fps - point.fps_low for point, _ in group],
-            [point.fps_high - point.fps for point, _ in group],
-        )
-        axes.errorbar(
-            fps,
-            [y for _, y in group],
-            xerr=spread,
-            fmt=marker,
-            color=color,
-            ecolor=color,
-            elinewidth=0.5,
-            alpha=0.85 if color == INK else 0.4,
-            markersize=4.5,
-            label=f"latency {evidence}",
-            zorder=2,
-        )
+    executors = list(dict.fromkeys(executor_of(point) for point, _ in drawn))
+    several = color == INK and len(executors) > 1
+    groups: dict[tuple[str, Evidence], list[tuple[Point, float]]] = {}
+    for point, y in drawn:
+        executor = executor_of(point) if several else ""
+        groups.setdefault((executor, point.evidence.latency), []).append((point, y))
+    for evidence in MARKERS:
+        for executor in executors if several else [""]:
+            own = COLOURS[executors.index(executor) % len(COLOURS)] if several else color
+            label = f"{executor}, {evidence}" if several else f"latency {evidence}"
+            _group(axes, groups.get((executor, evidence), []), own, MARKERS[evidence], label)
+
+
+def _group(
+    axes: Axes, group: Sequence[tuple[Point, float]], color: str, marker: str, label: str
+) -> None:
+    """Points of one colour and marker, with their intervals."""
+    if not group:
+        return
+    spread = (
+        [point.fps - point.fps_low for point, _ in group],
+        [point.fps_high - point.fps for point, _ in group],
+    )
+    axes.errorbar(
+        [point.fps for point, _ in group],
+        [y for _, y in group],
+        xerr=spread,
+        fmt=marker,
+        color=color,
+        ecolor=color,
+        elinewidth=0.5,
+        alpha=0.4 if color == PROMISE else 0.85,
+        markersize=4.5,
+        label=label,
+        zorder=2,
+    )
 
 
 def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None:
@@ -100,9 +119,8 @@ def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None
     value = point.metric(found.objective)
     if value is None:
         return
-    executor = f"{point.precision} on {RUNTIMES[point.runtime]}"
     told = f"{point.fps:.1f} FPS, {caption(found.objective, value)}"
-    label = f"{role}: {point.arch.label()}\n{executor}, {told}"
+    label = f"{role}: {point.arch.label()}\n{executor_of(point)}, {told}"
     axes.plot(
         [point.fps],
         [value],

@@ -36,8 +36,12 @@ ROWS = 16
 
 def name_of(point: Point) -> str:
     """A candidate in a few words."""
-    executor = f"{point.precision} on {RUNTIMES[point.runtime]}"
-    return f"{point.arch.label()}, {executor}"
+    return f"{point.arch.label()}, {executor_of(point)}"
+
+
+def executor_of(point: Point) -> str:
+    """What runs a candidate, such as fp32 on OpenVINO."""
+    return f"{point.precision} on {RUNTIMES[point.runtime]}"
 
 
 def caption(metric: Metric, value: float | None) -> str:
@@ -225,7 +229,8 @@ def _notes(found: Found, profile: Profile) -> list[tuple[str, str]]:
         if not support.supported
     ]
     if profile.machine is not None:
-        told = f"{profile.machine.processor}, {profile.machine.date}"
+        since = "from {} on" if len({c.runtime for c in profile.calibrations}) > 1 else "{}"
+        told = f"{profile.machine.processor}, {since.format(profile.machine.date)}"
         notes.append(f"timed on {told}; rts2-profile fit --device {profile.name} times yours")
     known = {point.resolution for point in profile.points}
     if found.resolution not in known:

@@ -31,6 +31,16 @@ def _model() -> PartModel:
     return PartModel(pixels=tuple(sizes), tables=tables)
 
 
+def _scaled(model: PartModel, small: float, large: float) -> PartModel:
+    """Places of fewer than nine channels take `small` times as long, all others `large`."""
+    tables = {}
+    for part, table in model.tables.items():
+        factors = [small if at[0] < 9 else large for at in product(*axis_values(part))]
+        rows = (tuple(f * ms for f, ms in zip(factors, row, strict=True)) for row in table.ms)
+        tables[part] = PartTable(axes=table.axes, ms=tuple(rows))
+    return PartModel(pixels=model.pixels, tables=tables)
+
+
 def _ends() -> list[Arch]:
     """Of every stage count the networks that span the space."""
     return [
@@ -81,3 +91,28 @@ def by_parts() -> Profile:
         }
     )
     return Profile.model_validate(known.model_dump(by_alias=True))
+
+
+@pytest.fixture(scope="session")
+def two_runtimes(by_parts: Profile) -> Profile:
+    """ONNX Runtime is faster for small networks, OpenVINO for large ones, and in bf16 for all."""
+    (first,) = by_parts.calibrations
+    calibrations, points = [first], list(by_parts.points)
+    for precision, small, large in (("fp32", 2.0, 0.5), ("bf16", 0.9, 0.3)):
+        model = _scaled(first.model, small, large)
+        told = {"runtime": "openvino", "precision": precision}
+        calibrations.append(first.model_copy(update=told | {"model": model}))
+        for point, residual in zip(by_parts.points, first.residuals, strict=True):
+            latency_ms = predict_ms(model, point.arch, point.resolution) * exp(residual)
+            points.append(point.model_copy(update=told | {"fps": 1000 / latency_ms}))
+    support = by_parts.precisions[0].model_copy(update={"precision": "bf16"})
+    runtime = by_parts.runtimes[0].model_copy(update={"runtime": "openvino", "version": "2026.3"})
+    both = by_parts.model_copy(
+        update={
+            "calibrations": tuple(calibrations),
+            "points": tuple(points),
+            "precisions": (*by_parts.precisions, support),
+            "runtimes": (*by_parts.runtimes, runtime),
+        }
+    )
+    return Profile.model_validate(both.model_dump(by_alias=True))

@@ -590,6 +590,49 @@ def test_a_search_by_parts_is_as_sure_as_its_residuals(by_parts: Profile) -> Non
         assert log(point.fps / point.fps_low) == pytest.approx(0.23)
 
 
+def test_runtimes_and_precisions_of_one_profile_compete(two_runtimes: Profile) -> None:
+    """All are candidates; of bf16 no accuracy is known. The front of both is what remains of the
+    fronts of each.
+    """
+    found = search(Question(two_runtimes, 1), PUBLISHED, USUAL)
+    assert found.space.size == 3 * USUAL.size()
+    assert {(p.runtime, p.precision) for p in found.front} == {
+        ("onnxruntime", "fp32"),
+        ("openvino", "fp32"),
+    }
+    left_out = {entry.reason: entry.count for entry in found.left_out}
+    assert left_out["no d1_all is known in bf16"] == 2 / 3 * USUAL.size()  # the third is semantic
+    alone = [
+        point
+        for runtime in ("onnxruntime", "openvino")
+        for point in search(Question(two_runtimes, 1, runtimes=(runtime,)), PUBLISHED, USUAL).front
+    ]
+    assert set(map(repr, found.front)) <= set(map(repr, alone))
+    for point in alone:
+        beaten = [p for p in found.front if p.fps >= point.fps and p.d1_all <= point.d1_all]
+        assert beaten, point
+
+
+def test_each_runtime_predicts_with_its_own_tables(two_runtimes: Profile) -> None:
+    models = {(c.runtime, c.precision): c.model for c in two_runtimes.calibrations}
+    for point in search(Question(two_runtimes, 1, (960, 288)), PUBLISHED, USUAL).front:
+        expected = predict_ms(models[point.runtime, point.precision], point.arch, (960, 288))
+        assert point.latency_ms == pytest.approx(expected)
+
+
+def test_a_precision_of_one_runtime_alone_is_asked_for(two_runtimes: Profile) -> None:
+    only = _executors(Question(two_runtimes, 1, precisions=("bf16",)))
+    assert [(e.runtime, e.precision) for e in only] == [("openvino", "bf16")]
+    with pytest.raises(UsageError, match="has no latency for that choice; it has fp32 on onnx"):
+        search(
+            Question(two_runtimes, 1, precisions=("bf16",), runtimes=("onnxruntime",)),
+            PUBLISHED,
+            USUAL,
+        )
+    with pytest.raises(UsageError, match="does not run fp16: ONNX Runtime computes FP16 through"):
+        search(Question(two_runtimes, 1, precisions=("fp16",)), PUBLISHED, USUAL)
+
+
 def test_int8_is_refused_on_the_tx2_and_says_why() -> None:
     with pytest.raises(UsageError, match=r"Jetson TX2 does not run int8: .*DP4A.*fp16"):
         search(question(precisions=("int8",)), PUBLISHED, SMALL)

@@ -9,10 +9,11 @@ import pytest
 from PIL import Image
 
 from rts2.model.errors import Rts2Error
-from rts2.profiles.profile import load
+from rts2.profiles.profile import Profile, load
 from rts2.search.accuracy import source
 from rts2.search.exhaustive import Question, search
-from rts2.search.plot import draw, save
+from rts2.search.plot import MARKERS, draw, save
+from rts2.search.report import executor_of
 from rts2.search.result import Found
 from rts2.search.space import Space
 
@@ -88,6 +89,22 @@ def test_evidence_has_markers_of_its_own() -> None:
     assert kinds.keys() == {"published", "interpolated", "extrapolated"}
     assert all(len(used) == 1 for used in kinds.values())
     assert len({next(iter(used)) for used in kinds.values()}) == 3
+
+
+def test_each_runtime_and_precision_has_a_colour_and_is_named(two_runtimes: Profile) -> None:
+    result = search(Question(two_runtimes, 10.0), source("published"), SMALL)
+    (axes,) = draw(result, "My PC").axes
+    colours: dict[str, set[str]] = {}
+    for line in axes.get_lines():
+        for x, y in line.get_xydata() if line.get_marker() in MARKERS.values() else ():
+            (point,) = (p for p in result.front if (p.fps, p.d1_all) == (x, y))
+            colours.setdefault(executor_of(point), set()).add(str(line.get_color()))
+    assert colours.keys() == {"fp32 on ONNX Runtime", "fp32 on OpenVINO"}
+    assert [len(known) for known in colours.values()] == [1, 1]
+    assert len(set.union(*colours.values())) == 2
+    labels = axes.get_legend_handles_labels()[1]
+    told = {(executor_of(p), p.evidence.latency) for p in result.front}
+    assert {f"{executor}, {evidence}" for executor, evidence in told} <= set(labels)
 
 
 def test_the_pick_and_the_prospect_are_stars() -> None:
