@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from ..model.arch import UNTRAINED, Arch, Form, Precision
 from ..model.errors import Rts2Error
 from ..model.files import read_json, write_json
+from ..model.machine import release_memory
 from ..model.ops import ops
 from .calibrate import FORMS, fit
 from .heldout import hold_outs
@@ -155,6 +156,7 @@ class Bench:
         if self._last != known:
             self._exported(job.arch, job.resolution, "network", job.forms)
             self._last = known
+            release_memory()
         return self._folder / "network.onnx"
 
     def _exported(

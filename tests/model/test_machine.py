@@ -1,11 +1,13 @@
 """What the machine says of itself."""
 
+import ctypes
 import os
 import platform
+from typing import Any
 
 import pytest
 
-from rts2.model.machine import cores, features, processor
+from rts2.model.machine import cores, features, processor, release_memory
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,3 +55,25 @@ def test_features_are_those_that_the_system_tells(
     assert features() == known
     monkeypatch.setattr("pathlib.Path.exists", lambda _path: False)
     assert features() == set()
+
+
+def test_memory_is_given_back_where_the_c_library_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing happens where it cannot: musl has no `malloc_trim`, macOS no glibc."""
+    asked: list[int] = []
+
+    class Library:
+        def malloc_trim(self, pad: Any) -> None:
+            asked.append(pad.value)
+
+    for system, library, count in (
+        ("Linux", Library(), 1),
+        ("Linux", object(), 0),
+        ("Darwin", Library(), 0),
+    ):
+        asked.clear()
+        monkeypatch.setattr(platform, "system", lambda system=system: system)
+        monkeypatch.setattr(ctypes, "CDLL", lambda name, library=library: library)
+        release_memory()
+        assert asked == [0] * count
+    monkeypatch.undo()
+    release_memory()

@@ -361,6 +361,17 @@ def test_a_bench_times_real_networks_as_a_whole_and_by_part(quick: Bench) -> Non
     assert min(sample.latency_ms, sample.reference_ms, sample.ratio) > 0
 
 
+def test_memory_is_given_back_after_each_network(
+    quick: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once for each that is exported, not again for its other precisions or timings."""
+    released: list[None] = []
+    monkeypatch.setattr(measure, "release_memory", lambda: released.append(None))
+    for arch in (SMALL, SMALL, Arch(c=2, stages=1), SMALL):
+        quick._graph(Job(arch, (96, 64), "fp32"))
+    assert len(released) == 3
+
+
 def test_more_work_takes_longer(quick: Bench) -> None:
     """About 200 times the multiply-adds: no load of the machine turns that around."""
     small = quick.time(Job(SMALL, (96, 64), "fp32"))
