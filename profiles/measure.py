@@ -47,6 +47,9 @@ REFERENCE: tuple[Arch, Resolution] = (Arch(c=4, stages=2), (640, 192))
 PROFILED_RUNS = 5
 """Runs whose nodes are timed, on top of those that time the whole network."""
 
+MADE: dict[Runtime, tuple[Precision, ...]] = {"onnxruntime": ("int8",)}
+"""What a runtime does not make of a float network by itself, and runs where the graph has it."""
+
 FIT_ERROR, FIT_PATIENCE = 0.02, 3.0
 """What a fit strives for, and for how long: another network tells more than one that is timed
 better."""
@@ -126,7 +129,7 @@ class Bench:
         from .runtimes import precisions
 
         self.runtime, self.threads = runtime, threads
-        self.precisions = precisions(runtime)
+        self.precisions: tuple[Precision, ...] = (*precisions(runtime), *MADE.get(runtime, ()))
         self._folder = Path(mkdtemp(prefix="rts2."))
         weakref.finalize(self, rmtree, self._folder, ignore_errors=True)
         self._last: tuple[Any, ...] | None = None
@@ -157,7 +160,19 @@ class Bench:
             self._exported(job.arch, job.resolution, "network", job.forms)
             self._last = known
             release_memory()
-        return self._folder / "network.onnx"
+        path = self._folder / "network.onnx"
+        return self._in_integers(path) if job.precision in MADE.get(self.runtime, ()) else path
+
+    def _in_integers(self, path: Path) -> Path:
+        """The network with its usual layers in integers; how long they take no range changes."""
+        from ..model.graph import header_of, load_graph, save_graph
+        from ..model.qdq import integers, nominal, usual
+
+        model = load_graph(path)
+        header = header_of(model, path).model_copy(update={"precision": "int8"})
+        made = path.with_name("integers.onnx")
+        save_graph(integers(model, usual(model), nominal(model)), header, made)
+        return made
 
     def _exported(
         self,

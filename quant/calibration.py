@@ -299,7 +299,7 @@ def _restored(cache: Path, key: str) -> Calibration | None:
     if not cache.is_file():
         return None
     try:
-        with np.load(cache, allow_pickle=False) as kept:
+        with cache.open("rb") as file, np.load(file, allow_pickle=False) as kept:
             if str(kept["key"]) != key:
                 return None
             names = [str(name) for name in kept["names"]]

@@ -29,15 +29,13 @@ from ..profiles.profile import Calibration, Profile, Resolution, Runtime
 from ..profiles.profile import Point as Timing
 from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric
 from .front import fastest, nondominated, pick
+from .lowered import Lowered, measured
 from .result import Coverage, Found, LeftOut, Point, PointEvidence, Task
 from .space import Parts, Space
 
 Flags = NDArray[np.bool_]
 
 BYTES_PER_WEIGHT: dict[Precision, int] = {"fp32": 4, "bf16": 2, "fp16": 2, "int8": 1}
-
-KEEPS_ACCURACY: tuple[Precision, ...] = ("fp32", "fp16")
-"""Half precision rounds to 11 bits, far below the tables' last digit; integers do not."""
 
 
 @dataclass(frozen=True)
@@ -97,15 +95,23 @@ EVIDENCE: tuple[Evidence, ...] = ("published", "measured", "interpolated", "extr
 EXTRAPOLATED = EVIDENCE.index("extrapolated")
 
 
-def search(question: Question, source: AccuracySource, space: Space | None = None) -> Found:
+def search(
+    question: Question,
+    source: AccuracySource,
+    space: Space | None = None,
+    lowered: Lowered | None = None,
+) -> Found:
     """Every candidate of `space`, the front, the pick and the prospect.
+
+    The source tells accuracies in fp32; `lowered` what other precisions make of them, the changes
+    that come with rts2 unless given.
 
     Raises:
         UsageError: a precision or runtime that the device refuses or lacks, a confidence that
             its calibration points cannot give, or a measured network outside of the space.
     """
     started = time.perf_counter()
-    space = space or Space()
+    space, lowered = space or Space(), lowered or measured()
     for arch in source.named:
         if space.position(arch) is None:
             raise UsageError(f"{arch.label()} was measured, and lies outside of the space")
@@ -116,7 +122,9 @@ def search(question: Question, source: AccuracySource, space: Space | None = Non
     for stages in space.stages:
         accuracy = source.columns(space, stages)
         for index, executor in enumerate(executors):
-            block = _Block(space, question, executor, accuracy, totals, stages)
+            own = lowered.applied(accuracy, space, stages, executor.precision)
+            known = lowered.knows(executor.precision)
+            block = _Block(space, question, executor, own, known, totals, stages)
             left_out.update(block.leave_out())
             found.append(block.columns(index, source.exact_evidence))
     front = _front(question, totals, executors, found)
@@ -232,11 +240,13 @@ class _Block:
         question: Question,
         executor: Executor,
         accuracy: Accuracy,
+        known: bool,
         totals: _Totals,
         stages: int,
     ) -> None:
+        """`known`: whether anything is known of accuracies in the executor's precision."""
         self.space, self.question, self.executor = space, question, executor
-        self.accuracy, self.totals, self.stages = accuracy, totals, stages
+        self.accuracy, self.known, self.totals, self.stages = accuracy, known, totals, stages
         self.shape = space.shape(stages)
         self.latency_ms = totals.latency_ms(executor.model, question.resolution, stages)
         self._free = np.ones(self.shape, dtype=bool)
@@ -268,7 +278,7 @@ class _Block:
         """Candidates whose accuracy nobody knows, with what is missing."""
         name = self.question.objective
         precision = self.executor.precision
-        if precision not in KEEPS_ACCURACY:
+        if not self.known:
             yield f"no {name} is known in {precision}", np.array(True)
         unknown = np.isnan(self.accuracy.metrics[name])
         for stage in range(self.stages):
