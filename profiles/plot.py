@@ -97,9 +97,8 @@ def _intervals(
         errors.axhspan(
             100 * (exp(-half) - 1),
             100 * (exp(half) - 1),
-            facecolor=colour if several else PALE,
-            alpha=0.08 if several else 0.25,
-            edgecolor=colour,
-            linewidth=1.2 if several else 0,
+            facecolor=(colour, 0.06) if several else (PALE, 0.25),
+            edgecolor=(colour, 0.8),
+            linewidth=1 if several else 0,
             label=f"90% interval, {name}" if several else "90% interval",
         )
