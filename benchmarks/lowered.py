@@ -31,6 +31,7 @@ from rts2.model.qdq import integers, usual
 from rts2.profiles.runtimes import available, precisions
 from rts2.quant.calibration import calibrate
 from rts2.quant.half import OpenVinoPredictor
+from rts2.quant.intermediate import to_ir
 from rts2.quant.parity import measure
 from rts2.quant.source import opened
 
@@ -61,7 +62,8 @@ def changes(
         made = integers(model, usual(model), known.ranges("percentile"))
         others = {"int8": OnnxPredictor.of(made)}
         if half:
-            others["bf16"] = OpenVinoPredictor(path, "bf16", cores())
+            to_ir(path, path.with_suffix(".xml"))
+            others["bf16"] = OpenVinoPredictor(path, path.with_suffix(".xml"), "bf16", cores())
         for precision, other in others.items():
             found = measure(OnnxPredictor(path), other, frames)
             yield row(arch, precision, found.reference, found.other)

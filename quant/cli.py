@@ -39,7 +39,16 @@ if TYPE_CHECKING:
 FLOAT, REPORT, PAGE, PICTURE = "fp32.onnx", "quantize.json", "report.html", "audit.png"
 CACHE: Final = "calibration.npz"
 
-MADE: Final = ("int8.onnx", "fp16.onnx", "openvino.onnx", FLOAT, PAGE, PICTURE, REPORT)
+MADE: Final = (
+    "int8.onnx",
+    "fp16.onnx",
+    "openvino.xml",
+    "openvino.bin",
+    FLOAT,
+    PAGE,
+    PICTURE,
+    REPORT,
+)
 """What an earlier run may have left, and a later one with another outcome does not write."""
 
 HERE: Final = "cpu"
@@ -241,10 +250,11 @@ class _Run:
         from .report import in_forms
 
         found = quantize(self.source, self.precision, self.frames, self.budget, self.threads)
-        report = self._timed(found, found.graph, "OpenVINO", "fp32 in ONNX Runtime")
+        weights = found.graph.with_suffix(".bin")
+        report = self._timed(found, weights, "OpenVINO", "fp32 in ONNX Runtime")
         files = {FLOAT: found.parent}
         if found.delivered:
-            files["openvino.onnx"] = found.graph
+            files |= {"openvino.xml": found.graph, "openvino.bin": found.graph.with_suffix(".bin")}
         forms = in_forms(found.float_forms, found.header.forms)
         return self._written(_with(report, forms=forms), files)
 

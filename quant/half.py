@@ -1,7 +1,7 @@
 """Half precision on the CPU at hand, through OpenVINO, which has kernels for it.
 
-ONNX Runtime has none on a CPU. The graph stays one of float: OpenVINO is told to compute it in fp16
-or bf16 when it compiles it, whichever the processor has.
+ONNX Runtime has none on a CPU. The weights stay float: OpenVINO is told to compute in fp16 or bf16,
+whichever the processor has, when it compiles the network; what carries disparities it keeps float.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ..model.graph import GraphHeader
 from ..model.predictor import OnnxPredictor
 from ..profiles.runtimes import precisions
 from .budget import Budget
+from .intermediate import to_ir
 from .parity import Measured, measure
 from .race import Duel, Runner, duel, race
 from .source import Source, opened
@@ -36,7 +37,7 @@ class Halved:
     parent: Path
     """The float graph, in the form that ONNX Runtime runs fastest."""
     graph: Path
-    """The float graph, in the form that OpenVINO runs fastest at the precision."""
+    """OpenVINO's own format (.xml, a .bin beside it), in the form that it runs fastest."""
     header: GraphHeader
     float_forms: tuple[Form, ...] | None
     measured: Measured
@@ -50,13 +51,13 @@ class Halved:
 
 
 class OpenVinoPredictor(OnnxPredictor):
-    """An ONNX graph of one size, computed by OpenVINO at a precision."""
+    """An ONNX graph of one size, computed by OpenVINO at a precision from its own format."""
 
-    def __init__(self, path: Path, precision: Precision, threads: int) -> None:
+    def __init__(self, path: Path, compiled: Path, precision: Precision, threads: int) -> None:
         from ..profiles.runtimes.ov import Session
 
         super().__init__(path)
-        self._compiled = Session(path, precision, threads)
+        self._compiled = Session(compiled, precision, threads)
 
     def _answer(self, pair: Mapping[str, NDArray[np.float32]]) -> list[NDArray[Any]]:
         return self._compiled.answer(self.outputs, pair)
@@ -78,14 +79,18 @@ def quantize(
         raise UsageError(f"this processor does not compute in {precision}; {instead}")
     graphs = {forms: source.graph(forms or None) for forms in source.forms or ((),)}
     plain = _fastest([Runner(path, "fp32") for path in graphs.values()], threads)
-    own = _fastest([Runner(path, precision, RUNTIME) for path in graphs.values()], threads)
-    pair = OnnxPredictor(plain.path), OpenVinoPredictor(own.path, precision, threads)
+    lowered = {path: path.with_suffix(".xml") for path in graphs.values()}
+    for path, other in lowered.items():
+        to_ir(path, other)
+    own = _fastest([Runner(other, precision, RUNTIME) for other in lowered.values()], threads)
+    graph = next(path for path, other in lowered.items() if other == own.path)
+    pair = OnnxPredictor(plain.path), OpenVinoPredictor(graph, own.path, precision, threads)
     shown = progress(frames, "judging", len(frames))
     measured = measure(*pair, (frame.read() for frame in shown))
     return Halved(
         plain.path,
         own.path,
-        opened(own.path)[1],
+        opened(graph)[1],
         opened(plain.path)[1].forms,
         measured,
         duel(own, plain, threads),

@@ -36,6 +36,10 @@ class Runner:
 
     def opened(self, threads: int) -> Callable[[], None]:
         """One run of it, on inputs of its own."""
+        if self.runtime == "openvino":
+            from ..profiles.runtimes.ov import Session
+
+            return Session(self.path, self.precision, threads).run
         return open_session(self.runtime, self.path, self.precision, threads).run
 
 

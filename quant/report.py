@@ -137,7 +137,7 @@ def sentence(delivered: bool, precision: Precision, duel: Duel, within: bool, pa
     if delivered:
         return f"{precision} is {faster} and within the accuracy budget"
     if not within:
-        return f"no choice of layers keeps the accuracy budget in {precision}: fp32 is delivered"
+        return f"{precision} does not keep the accuracy budget: fp32 is delivered"
     return f"{precision} would be {faster}, not surely faster: fp32 is delivered"
 
 

@@ -27,12 +27,15 @@ NATIVE: Final[dict[Precision, tuple[str, frozenset[str]]]] = {
 """What OpenVINO says where it can, and the processor's features of which one must be there: it
 also says so where it would only emulate."""
 
+IR: Final = ".xml"
+"""How a file of OpenVINO's own format ends."""
+
 PROFILED_WARM_UP = 3
 """Runs before the first that counts."""
 
 
 class Session:
-    """An ONNX file, compiled for the CPU, ready to run on inputs of its own."""
+    """An ONNX file, or OpenVINO's own format, compiled for the CPU, with inputs of its own."""
 
     def __init__(self, path: Path, precision: Precision, threads: int) -> None:
         self._path = path
@@ -84,8 +87,10 @@ class Session:
 
         from ...model.graph import load_graph
 
-        model = load_graph(self._path)
-        source = model.SerializeToString() if distinctly_named(model) else str(self._path)
+        source: Any = str(self._path)
+        if self._path.suffix != IR:
+            model = load_graph(self._path)
+            source = model.SerializeToString() if distinctly_named(model) else source
         settings = {
             "INFERENCE_PRECISION_HINT": HINTS[self._precision],
             "INFERENCE_NUM_THREADS": self._threads,
