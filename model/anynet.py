@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from .arch import RADIUS, STRIDES, Arch
 from .layers import preactivated
 from .rts2net import Stage
-from .volume import first_volume, residual_volume, soft_argmin
+from .volume import PLAIN, Matching
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -57,10 +57,11 @@ class AnyNet(nn.Module):
         self.arch = arch
         self.features = Features(arch.c, arch.stages)
         self.regularize = nn.ModuleList(_six_convs(width) for width in arch.conv3d)
+        self.matching: Matching = PLAIN
 
     def forward(self, left: Tensor, right: Tensor, stages: int | None = None) -> list[Stage]:
         """(B, 3, H, W) twice, sides multiples of 16 → one `Stage` per stage, at full resolution."""
-        depth = self.arch.up_to(stages).stages
+        depth, matching = self.arch.up_to(stages).stages, self.matching
         size = left.shape[-2:]
         batch = left.shape[0]
         found: list[Stage] = []
@@ -68,12 +69,12 @@ class AnyNet(nn.Module):
             left_features, right_features = features[:batch], features[batch:]
             stride = STRIDES[stage]
             if stage == 0:
-                volume = first_volume(left_features, right_features, self.arch.d_max)
+                volume = matching.first_volume(left_features, right_features, self.arch.d_max)
             else:
                 around = _resized(found[-1].disparity, features.shape[-2:]) / stride
-                volume = residual_volume(left_features, right_features, around).flip(1)
+                volume = matching.residual_volume(left_features, right_features, around).flip(1)
             volume = self.regularize[stage](volume.unsqueeze(1)).squeeze(1)
-            step = soft_argmin(volume, 0 if stage == 0 else -RADIUS) * stride
+            step = matching.soft_argmin(volume, 0 if stage == 0 else -RADIUS) * stride
             disparity = _resized(step, size)
             found.append(Stage(disparity + found[-1].disparity if found else disparity))
         return found

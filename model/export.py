@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
-from .forms import formed, forms_run
+from .forms import formed, forms_run, rewritten
 from .graph import GraphHeader, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
@@ -63,10 +63,23 @@ class Deployed(nn.Module):
         disparity = self._full(stage.best).flatten(0, 1)
         if stage.scores is None:
             return (disparity,)
-        return disparity, self._full(stage.scores).argmax(1).int()
+        return disparity, self._classes(stage.scores)
+
+    def _classes(self, scores: Tensor) -> Tensor:
+        return self._full(scores).argmax(1).int()
 
     def _full(self, maps: Tensor) -> Tensor:
         return maps if self.factor == 1 else enlarge(maps, self.factor)
+
+
+class Exported(Deployed):
+    """The same as a graph holds it: in forms that give the same and are faster there."""
+
+    def __init__(
+        self, network: Network, stages: int | None = None, forms: Sequence[Form] | None = None
+    ) -> None:
+        super().__init__(network, stages, forms)
+        self.network = rewritten(self.network)
 
 
 def export(
@@ -91,8 +104,7 @@ def export(
     """
     if opset not in OPSETS:
         raise UsageError(f"opset must be {OPSETS[0]} to {OPSETS[-1]}, not {opset}")
-    # A copy, as the exporter plays with its modes.
-    deployed = Deployed(deepcopy(network), stages, forms).eval()
+    deployed = Exported(network, stages, forms).eval()
     height, width = padded(resolution, deployed.arch.multiple)
     header = GraphHeader(
         arch=deployed.arch,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from .arch import FACTORS, RADIUS, STRIDES, Arch
 from .layers import conv_block, conv_pair, enlarge
-from .volume import first_volume, residual_volume, soft_argmin
+from .volume import PLAIN, Matching
 
 
 class Stage(NamedTuple):
@@ -91,6 +91,7 @@ class Volume(nn.Module):
     def __init__(self, stage: int, planes: int) -> None:
         super().__init__()
         self.stage, self.planes = stage, planes
+        self.matching: Matching = PLAIN
 
     def forward(self, embedded: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Both images' features and the disparity of the stage before → the volume, and around
@@ -98,9 +99,10 @@ class Volume(nn.Module):
         """
         left, right = embedded.chunk(2)
         if before is None:
-            return first_volume(left, right, self.planes), None
+            return self.matching.first_volume(left, right, self.planes), None
         around = enlarge(before, 2)
-        return residual_volume(left, right, around / STRIDES[self.stage]), around
+        at = around / STRIDES[self.stage]
+        return self.matching.residual_volume(left, right, at), around
 
 
 class Regression(nn.Module):
@@ -109,10 +111,11 @@ class Regression(nn.Module):
     def __init__(self, stage: int) -> None:
         super().__init__()
         self.first, self.stride = -RADIUS if stage else 0, STRIDES[stage]
+        self.matching: Matching = PLAIN
 
     def forward(self, cost: Tensor, around: Tensor | None) -> Tensor:
         """(B, planes, h, w) → (B, 1, h, w), in pixels of the full resolution."""
-        found = soft_argmin(cost, self.first) * self.stride
+        found = self.matching.soft_argmin(cost, self.first) * self.stride
         return found if around is None else found + around
 
 

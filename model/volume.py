@@ -6,6 +6,8 @@ linear blend; no two-dimensional sampler is involved, and every operator exports
 
 from __future__ import annotations
 
+from typing import NamedTuple, Protocol
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -65,3 +67,36 @@ def soft_argmin(cost: Tensor, first: int) -> Tensor:
 def _distance(left: Tensor, right: Tensor) -> Tensor:
     """The L1 distance over the channels: (B, C, H, W) twice → (B, 1, H, W)."""
     return (left - right).abs().sum(1, keepdim=True)
+
+
+class FirstVolume(Protocol):
+    """What `first_volume` is."""
+
+    def __call__(self, left: Tensor, right: Tensor, planes: int) -> Tensor: ...
+
+
+class ResidualVolume(Protocol):
+    """What `residual_volume` is."""
+
+    def __call__(self, left: Tensor, right: Tensor, disparity: Tensor) -> Tensor: ...
+
+
+class SoftArgmin(Protocol):
+    """What `soft_argmin` is."""
+
+    def __call__(self, cost: Tensor, first: int) -> Tensor: ...
+
+
+class Matching(NamedTuple):
+    """How a network computes its volumes and what it reads from them.
+
+    The same values can be had in other steps, which other runtimes are faster at; networks are
+    trained with `PLAIN`.
+    """
+
+    first_volume: FirstVolume
+    residual_volume: ResidualVolume
+    soft_argmin: SoftArgmin
+
+
+PLAIN = Matching(first_volume, residual_volume, soft_argmin)

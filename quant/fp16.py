@@ -11,6 +11,7 @@ pass through fp16 between two of them, and gives casts of equal names; hence a p
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import prod
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ HALF: Final = TensorProto.FLOAT16
 
 ALWAYS_FLOAT: Final = {"Resize": (1, 2)}
 """Inputs that ONNX wants in fp32 whatever the rest is: the region and the scales of Resize."""
+
+BEGIN: Final = frozenset(("ReduceMin", "Softmax"))
+END: Final = frozenset(("Div", "ReduceSum"))
+"""Operators that begin and end a soft-argmin, in graphs of this version and of earlier ones."""
 
 Role = Literal["soft-argmin", "disparity", "coordinate"]
 
@@ -44,36 +49,37 @@ class Kept(NamedTuple):
 def kept_float(model: onnx.ModelProto) -> list[Kept]:
     """The operators that `to_fp16` leaves in fp32: all that carry a disparity, in graph order.
 
-    They are found by where their values come from. A softmax begins a soft-argmin, its sum ends it;
-    what descends from there is a disparity as long as it has a single channel, and from where it is
-    taken from the columns of the image it is a coordinate. Whatever joins features ends the way.
+    They are found by where their values come from. The least cost begins a soft-argmin, or a
+    softmax does, and a quotient or a sum ends it; what descends from there is a disparity as long
+    as it has a single channel, and from where it is taken from the columns of the image it is a
+    coordinate. Whatever joins features ends the way.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
     shapes = _values(model)
+    sizes = {name: prod(shape) for name, (_, shape) in shapes.items()}
     roles: dict[str, Role] = {}
     kept = []
     for node in model.graph.node:
-        kind, shape = shapes[node.output[0]]
-        if kind != FLOAT:
+        if shapes[node.output[0]][0] != FLOAT:
             continue
-        role = _role(node, [roles[name] for name in node.input if name in roles], shape, constants)
+        above = [name for name in node.input if name in roles]
+        grows = sizes[node.output[0]] > max((sizes[name] for name in above), default=0)
+        role = _role(node, [roles[name] for name in above], grows, constants)
         if role is not None:
-            roles[node.output[0]] = role
+            roles |= dict.fromkeys(node.output, role)
             kept.append(Kept(node.name, REASONS[role]))
     return kept
 
 
-def _role(
-    node: onnx.NodeProto, above: list[Role], shape: tuple[int, ...], constants: set[str]
-) -> Role | None:
+def _role(node: onnx.NodeProto, above: list[Role], grows: bool, constants: set[str]) -> Role | None:
     """What a node's output carries, given what its inputs do."""
-    if node.op_type == "Softmax":
+    if node.op_type in BEGIN:
         return "soft-argmin"
     if not above:
         return None
     if above[0] == "soft-argmin":
-        return "disparity" if node.op_type == "ReduceSum" else "soft-argmin"
-    if len(shape) == 4 and shape[1] != 1:
+        return "disparity" if node.op_type in END else "soft-argmin"
+    if grows and node.op_type != "Resize":
         return None
     from_columns = node.op_type == "Sub" and node.input[0] in constants
     return "coordinate" if from_columns or "coordinate" in above else "disparity"
@@ -98,6 +104,8 @@ def to_fp16(model: onnx.ModelProto) -> onnx.ModelProto:
             elif kinds.get(name, wanted) != wanted:
                 node.input[index] = graph.cast(name, wanted)
         kinds |= {name: wanted for name in node.output if given[name][0] == FLOAT}
+        if node.op_type == "Cast" and given[node.output[0]][0] == FLOAT:
+            node.attribute[0].i = wanted
         graph.nodes.append(node)
     return graph.instead_of(model)
 
@@ -114,7 +122,9 @@ def emulated(model: onnx.ModelProto) -> onnx.ModelProto:
     graph = _Graph({tensor.name: tensor for tensor in model.graph.initializer})
     for node in _copies(model):
         if node.op_type == "Cast":
-            graph.nodes.append(node)
+            if graph.known.isdisjoint(node.output):  # else one of ours came before, and is the same
+                graph.known.update(node.output)
+                graph.nodes.append(node)
             continue
         node.input[:] = [graph.cast(x, FLOAT) if kinds.get(x) == HALF else x for x in node.input]
         rounded = [name for name in node.output if kinds[name] == HALF]

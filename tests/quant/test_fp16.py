@@ -42,15 +42,15 @@ def test_all_that_carries_a_disparity_is_kept(network: Make, arch: Arch, tmp_pat
     model = exported(network, arch, tmp_path)
     kept = dict(kept_float(model))
     counts = Counter(kept.values())
-    # A soft-argmin, softmax and product, a stage; with refinement two, but none for the coarse
-    # disparity of the last, which nobody asks for.
+    # A soft-argmin a stage: least cost, difference, exponential, shape, sums, one and the other;
+    # with refinement two, but none for the coarse disparity of the last, which nobody asks for.
     regressions = 2 * arch.stages - 1 if arch.refinement else arch.stages
-    assert counts[REASONS["soft-argmin"]] == 2 * regressions
-    # A residual volume: x - disparity, floor, fraction, five sums with an offset, six clips.
-    assert counts[REASONS["coordinate"]] == 14 * (arch.stages - 1)
+    assert counts[REASONS["soft-argmin"]] == 7 * regressions
+    # A residual volume: x - disparity, floor, clip, fraction and its shape; an index is no float.
+    assert counts[REASONS["coordinate"]] == 5 * (arch.stages - 1)
     ends = {node.name for node in model.graph.node if "disparity" in node.output}
     assert ends <= kept.keys()
-    assert not [name for name in kept if name.endswith(("/Conv", "/Relu", "GatherElements"))]
+    assert not [name for name in kept if name.endswith(("/Conv", "/Relu", "Gather"))]
 
 
 @pytest.mark.parametrize("arch", ARCHS, ids=Arch.label)

@@ -20,10 +20,10 @@ from typing import TypeVar, get_args
 import torch
 from torch import Tensor, nn
 
-from .arch import Form
-from .checkpoint import Network
-from .errors import UsageError
-from .rts2net import Regularization, RTS2Net
+from ..arch import Form
+from ..checkpoint import Network
+from ..errors import UsageError
+from ..rts2net import Regularization, RTS2Net
 
 Formed = TypeVar("Formed", bound=Network)
 

@@ -1,0 +1,12 @@
+"""The forms in which a graph can hold the parts of a network.
+
+Every form computes the same from the same weights, but for rounding, in steps that runtimes are
+faster at. `formed` chooses between the forms of the 3D convs, which depend on the device;
+`rewritten` puts everything else into the form that graphs always have.
+"""
+
+from .banded import Banded, Formed, formed, forms_run
+from .matching import ROWS
+from .rewritten import rewritten
+
+__all__ = ["ROWS", "Banded", "Formed", "formed", "forms_run", "rewritten"]

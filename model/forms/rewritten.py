@@ -1,0 +1,20 @@
+"""A network as graphs hold it."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+from ..anynet import AnyNet
+from ..rts2net import Regression, Volume
+from .banded import Formed
+from .matching import ROWS
+
+
+def rewritten(network: Formed) -> Formed:
+    """A copy of the network, in eval mode, with its parts in the forms that graphs have."""
+    copy = deepcopy(network)
+    copy.eval()
+    for module in copy.modules():
+        if isinstance(module, Volume | Regression | AnyNet):
+            module.matching = ROWS
+    return copy

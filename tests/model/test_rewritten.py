@@ -1,0 +1,90 @@
+"""What graphs always hold in another form says the same as the plain network."""
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from rts2.model.arch import Arch
+from rts2.model.checkpoint import Network, build
+from rts2.model.forms import ROWS, rewritten
+from rts2.model.volume import PLAIN
+
+Lively = Callable[[Network], Network]
+
+
+def relative(wanted: Tensor, found: Tensor) -> float:
+    return float((wanted - found).abs().max() / wanted.abs().max())
+
+
+@pytest.mark.parametrize("planes", [2, 5, 24])
+def test_first_volumes_are_equal(planes: int) -> None:
+    left, right = torch.randn(2, 2, 6, 5, 17, dtype=torch.float64)
+    wanted = PLAIN.first_volume(left, right, planes)
+    found = ROWS.first_volume(left, right, planes)
+    assert wanted.shape == found.shape == (2, planes, 5, 17)
+    assert relative(wanted, found) <= 1e-12
+
+
+@pytest.mark.parametrize("channels", [2, 32, 40])
+def test_residual_volumes_are_equal_out_of_view_too(channels: int) -> None:
+    """Disparities of −30 … 30 in a map 17 wide: some planes see nothing, some a part."""
+    left, right = torch.randn(2, 2, channels, 7, 17, dtype=torch.float64)
+    disparity = torch.linspace(-30, 30, 2 * 7 * 17, dtype=torch.float64).view(2, 1, 7, 17)
+    wanted = PLAIN.residual_volume(left, right, disparity)
+    found = ROWS.residual_volume(left, right, disparity)
+    assert wanted.shape == found.shape == (2, 5, 7, 17)
+    assert relative(wanted, found) <= 1e-12
+
+
+@pytest.mark.parametrize("shift", range(-8, 9))
+def test_whole_disparities_meet_whole_pixels_at_the_bounds(shift: int) -> None:
+    left, right = torch.randn(2, 1, 3, 2, 4)
+    for edge in (-4.0, 0.0, 4.0):
+        disparity = torch.full((1, 1, 2, 4), shift + edge)
+        wanted = PLAIN.residual_volume(left, right, disparity)
+        assert relative(wanted, ROWS.residual_volume(left, right, disparity)) <= 1e-6
+
+
+@pytest.mark.parametrize("first", [0, -2])
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e4, 1e30])
+def test_soft_argmins_are_equal_for_costs_of_any_size(scale: float, first: int) -> None:
+    cost = torch.randn(2, 5, 7, 11) * scale
+    wanted, found = (form.soft_argmin(cost, first) for form in (PLAIN, ROWS))
+    assert wanted.shape == found.shape == (2, 1, 7, 11)
+    assert (wanted - found).abs().max() <= 1e-5
+
+
+def test_half_costs_are_taken_in_floats() -> None:
+    found = ROWS.soft_argmin(torch.randn(1, 5, 3, 4).half(), 0)
+    assert found.dtype == torch.float32
+
+
+@pytest.mark.parametrize("family", ["rts2net", "anynet"])
+def test_a_rewritten_network_is_a_copy_that_says_the_same(lively: Lively, family: str) -> None:
+    network = lively(build(Arch(family=family, c=2, d_max=5))).double().train()
+    before, random = deepcopy(network.state_dict()), torch.get_rng_state()
+    found = rewritten(network)
+    assert torch.equal(random, torch.get_rng_state())
+    assert all(module.training for module in network.modules())
+    assert not any(module.training for module in found.modules())
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+    forms = [m.matching for m in network.modules() if hasattr(m, "matching")]
+    assert set(forms) == {PLAIN}
+    left, right = torch.randn(2, 2, 3, 64, 96, dtype=torch.float64)
+    with torch.inference_mode():
+        answers = [net(left, right) for net in (network.eval(), found)]
+    for plain, other in zip(*answers, strict=True):
+        assert plain.best.std() > 0.1
+        assert relative(plain.best, other.best) <= 1e-10
+
+
+def test_names_of_modules_stay() -> None:
+    """Nodes are told by them: equal paths, convs where there were convs."""
+    network = build(Arch(c=1))
+    pairs = zip(network.named_modules(), rewritten(network).named_modules(), strict=True)
+    for (name, plain), (same, other) in pairs:
+        assert name == same
+        assert isinstance(plain, nn.Conv2d) == isinstance(other, nn.Conv2d)
