@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
-from .forms import formed, forms_run, rewritten
+from .forms import class_ids, formed, forms_run, rewritten
 from .graph import GraphHeader, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
@@ -80,6 +80,9 @@ class Exported(Deployed):
     ) -> None:
         super().__init__(network, stages, forms)
         self.network = rewritten(self.network)
+
+    def _classes(self, scores: Tensor) -> Tensor:
+        return class_ids(scores, self.factor)
 
 
 def export(

@@ -6,7 +6,8 @@ faster at. `formed` chooses between the forms of the 3D convs, which depend on t
 """
 
 from .banded import Banded, Formed, formed, forms_run
+from .head import class_ids
 from .matching import ROWS
 from .rewritten import rewritten
 
-__all__ = ["ROWS", "Banded", "Formed", "formed", "forms_run", "rewritten"]
+__all__ = ["ROWS", "Banded", "Formed", "class_ids", "formed", "forms_run", "rewritten"]

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import Network, build
-from rts2.model.forms import ROWS, rewritten
+from rts2.model.forms import ROWS, class_ids, rewritten
+from rts2.model.layers import enlarge
 from rts2.model.volume import PLAIN
 
 Lively = Callable[[Network], Network]
@@ -60,6 +61,15 @@ def test_soft_argmins_are_equal_for_costs_of_any_size(scale: float, first: int) 
 def test_half_costs_are_taken_in_floats() -> None:
     found = ROWS.soft_argmin(torch.randn(1, 5, 3, 4).half(), 0)
     assert found.dtype == torch.float32
+
+
+@pytest.mark.parametrize("factor", [4, 8, 16])
+@pytest.mark.parametrize("size", [(1, 1), (3, 5)])
+def test_classes_are_those_of_enlarged_scores(size: tuple[int, int], factor: int) -> None:
+    scores = torch.randn(2, 19, *size, dtype=torch.float64)
+    found = class_ids(scores, factor)
+    assert found.dtype == torch.int32
+    assert torch.equal(found, enlarge(scores, factor).argmax(1).int())
 
 
 @pytest.mark.parametrize("family", ["rts2net", "anynet"])
