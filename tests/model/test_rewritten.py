@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from copy import deepcopy
+from itertools import product
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import Network, build
 from rts2.model.forms import ROWS, class_ids, rewritten
+from rts2.model.forms.stem import Phases, phases
 from rts2.model.layers import enlarge
 from rts2.model.volume import PLAIN
 
@@ -72,6 +74,25 @@ def test_classes_are_those_of_enlarged_scores(size: tuple[int, int], factor: int
     assert torch.equal(found, enlarge(scores, factor).argmax(1).int())
 
 
+@pytest.mark.parametrize(
+    ("c", "wanted"),
+    [(1, (2, 2)), (4, (2, 2)), (8, (1, 2)), (12, (1, 2)), (16, (1, 1)), (20, (1, 1)), (24, (1, 2))],
+)
+def test_a_stem_has_as_many_pixels_in_its_channels_as_help(c: int, wanted: Phases) -> None:
+    assert phases(c) == wanted
+
+
+@pytest.mark.parametrize("c", [1, 3, 8, 16, 24])
+def test_encoders_are_equal_up_to_the_borders(lively: Lively, c: int) -> None:
+    network = lively(build(Arch(c=c, stages=1, conv3d=(1,)))).double()
+    left, right = torch.randn(2, 2, 3, 32, 96, dtype=torch.float64)
+    with torch.inference_mode():
+        wanted = network.encoder(left, right)
+        found = rewritten(network).encoder(left, right)
+    for a, b in zip([*wanted[0], wanted[1]], [*found[0], found[1]], strict=True):
+        assert relative(a, b) <= 1e-12
+
+
 @pytest.mark.parametrize("family", ["rts2net", "anynet"])
 def test_a_rewritten_network_is_a_copy_that_says_the_same(lively: Lively, family: str) -> None:
     network = lively(build(Arch(family=family, c=2, d_max=5))).double().train()
@@ -98,3 +119,15 @@ def test_names_of_modules_stay() -> None:
     for (name, plain), (same, other) in pairs:
         assert name == same
         assert isinstance(plain, nn.Conv2d) == isinstance(other, nn.Conv2d)
+
+
+def test_the_taps_of_a_widened_stem_are_those_of_the_old_one() -> None:
+    """Each old tap once for every pixel of a group; the second conv has each tap once."""
+    for c, (y, x) in product((2, 8), ((1, 2), (2, 2))):
+        if phases(c) != (y, x):
+            continue
+        network = build(Arch(c=c, stages=1, conv3d=(1,)))
+        plain, wide = network.encoder.stem, rewritten(network).encoder.stem
+        sums = [(a[0].weight.sum(), b[0].weight.sum()) for a, b in zip(plain, wide, strict=True)]
+        assert torch.isclose(sums[0][0] * y * x, sums[0][1], atol=1e-4)
+        assert torch.isclose(sums[1][0], sums[1][1], atol=1e-4)
