@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
@@ -88,8 +88,9 @@ def usual(model: onnx.ModelProto) -> tuple[str, ...]:
     return tuple(name for name in names if not SELDOM.match(name) and view.is_2d(name))
 
 
-SELDOM: Final = re.compile(r"encoder\.stem\.0\.|features\.stem\.0/|regularize\.\d\.layers\.0/")
-"""Layers that take three channels, or one: converting what they give costs more than integers save.
+SELDOM: Final = re.compile(r"encoder\.stem\.|features\.stem\.|regularize\.\d\.layers\.0/")
+"""Layers of large maps and few channels, and those that take one channel: converting what they give
+costs more than integers save.
 """
 
 
@@ -130,7 +131,12 @@ def integers(
     members = [name for layer in known.values() if layer.name in chosen for name in layer.members]
     if not members:
         return model
-    made = _quantizer(model, members, _tensor_ranges(ranges), symmetric)
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    held = () if symmetric else _hold_back(copy, members)
+    made = _quantizer(
+        copy, members, _tensor_ranges({**ranges, **_below_zero(ranges, held)}), symmetric
+    )
     _name_pairs(made.graph)
     return made
 
@@ -141,12 +147,10 @@ def _quantizer(
     from onnxruntime.quantization import QuantType
     from onnxruntime.quantization.qdq_quantizer import QDQQuantizer
 
-    copy = onnx.ModelProto()
-    copy.CopyFrom(model)
     options = {"ActivationSymmetric": True, **TENSORRT} if symmetric else {}
     with _silent():
         quantizer = QDQQuantizer(
-            copy,
+            model,
             per_channel=True,
             reduce_range=False,
             weight_qType=QuantType.QInt8,
@@ -164,6 +168,56 @@ def _quantizer(
     made: onnx.ModelProto = quantizer.model.model
     return made
 
+
+def _hold_back(model: onnx.ModelProto, members: Collection[str]) -> tuple[str, ...]:
+    """Puts a ReLU behind the float pooling that follows it, where integers follow that; returns
+    the values that it gives.
+
+    max(0, ·) and the largest of a window commute. ONNX Runtime moves a quantization ahead of a
+    pooling, and computes the pooling in integers on planes, six times as slow as in float on
+    blocks of channels; a ReLU that clips something (see `_below_zero`) is not passed.
+    """
+    view = _View(model)
+    held = []
+    for pool in view.nodes.values():
+        relu = view.maker.get(pool.input[0]) if pool.op_type == "MaxPool" else None
+        takers = view.takers.get(pool.output[0], [])
+        if relu is None or relu.op_type != "Relu" or {relu.name, pool.name} & set(members):
+            continue
+        if len(view.takers[relu.output[0]]) == 1 and any(t.name in members for t in takers):
+            given, between, last = relu.input[0], relu.output[0], pool.output[0]
+            pool.input[0], pool.output[0] = given, between
+            relu.input[0], relu.output[0] = between, last
+            held.append(last)
+            _swap(model.graph, relu, pool)
+            shape = view.floats[last]
+            _reshape(model.graph, between, shape)
+    return tuple(held)
+
+
+def _swap(graph: onnx.GraphProto, first: onnx.NodeProto, second: onnx.NodeProto) -> None:
+    """Exchanges the places of two nodes in a graph that lists them in the order of their work."""
+    names = [node.name for node in graph.node]
+    a, b = names.index(first.name), names.index(second.name)
+    kept = onnx.NodeProto()
+    kept.CopyFrom(graph.node[a])
+    graph.node[a].CopyFrom(graph.node[b])
+    graph.node[b].CopyFrom(kept)
+
+
+def _reshape(graph: onnx.GraphProto, value: str, shape: tuple[int, ...]) -> None:
+    for known in graph.value_info:
+        if known.name == value:
+            for side, length in zip(known.type.tensor_type.shape.dim, shape, strict=True):
+                side.dim_value = length
+
+
+def _below_zero(ranges: Ranges, names: Iterable[str]) -> Ranges:
+    """The ranges of what a ReLU gives, one step of 255 below zero: so the ReLU is not swallowed."""
+    return {name: (-ranges[name][1] / STEPS, ranges[name][1]) for name in names}
+
+
+STEPS: Final = 255
 
 TENSORRT: Final = {
     "AddQDQPairToWeight": True,

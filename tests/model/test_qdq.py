@@ -126,6 +126,7 @@ def test_the_usual_layers_leave_out_the_first_ones_and_3d(exported: onnx.ModelPr
     others = {layer.name for layer in layers(exported)} - chosen
     assert others == {
         "encoder.stem.0.0/Conv",
+        "encoder.stem.1.0/Conv",
         "regularize.0.layers.0/Conv",
         "regularize.2.layers.0/Conv",
         *(f"regularize.1.layers.{index}/Conv" for index in (0, 3, 6)),
@@ -145,3 +146,23 @@ def test_equal_arguments_give_equal_bytes(exported: onnx.ModelProto) -> None:
         for _ in range(2)
     ]
     assert made[0] == made[1]
+
+
+def test_a_quantization_does_not_pass_a_pooling_in_float(exported: onnx.ModelProto) -> None:
+    """The ReLU comes behind the pooling, clips something, and the answers are those of before."""
+    ranges = seen(exported)
+    chosen = usual(exported)
+    made = integers(exported, chosen, ranges)
+    nodes = {node.name: node for node in made.graph.node}
+    relu, pool = nodes["encoder.stem.1.2/Relu"], nodes["encoder.quarter.0/MaxPool"]
+    assert pool.input[0] == nodes["encoder.stem.1.0/Conv"].output[0]
+    assert relu.input[0] == pool.output[0]
+    quantizer = nodes["encoder.quarter.0/MaxPool:0_QuantizeLinear"]
+    assert quantizer.input[0] == relu.output[0]
+    values = {t.name: onnx.numpy_helper.to_array(t) for t in made.graph.initializer}
+    assert values[quantizer.input[2]] == 1
+    symmetric = integers(exported, chosen, ranges, symmetric=True)
+    order = [node.op_type for node in symmetric.graph.node if node.name in (relu.name, pool.name)]
+    assert order == ["Relu", "MaxPool"]
+    wanted = answers(exported)
+    assert np.abs(answers(made) - wanted).mean() < 0.05 * np.abs(wanted).mean()
