@@ -21,6 +21,7 @@ from rts2.profiles.latency import LatencyModel, predict_ms
 from rts2.profiles.profile import Profile, load
 from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, AccuracySource, source
 from rts2.search.exhaustive import EVIDENCE, Question, _Block, _executors, _Totals, search
+from rts2.search.lowered import Lowered, LoweredRows, Row
 from rts2.search.result import Found
 from rts2.search.space import Space
 
@@ -30,6 +31,35 @@ SMALL = Space(c=(1, 8, 9), d_max=(11, 12, 13), conv3d=((8, 16), (4, 8), (2, 4)))
 """378 archs; 27 of each stage count have the paper's 3D widths."""
 USUAL = Space(conv3d=((16,), (4,), (4,)))
 """Every arch of the paper's 3D widths: what the published tables can say anything of."""
+
+
+NOTHING = Lowered(LoweredRows(schema="rts2.lowered/1", protocol="a test", rows=()))
+"""Nobody has judged anything but fp32 and fp16."""
+
+
+def loss(c: int, stages: int, level: int) -> float:
+    """Points of D1 that a made-up int8 costs where it was judged."""
+    return 0.1 * stages + 0.2 * level + (0.3 if c == 1 else 0.0)
+
+
+LOSSES = Lowered(
+    LoweredRows(
+        schema="rts2.lowered/1",
+        protocol="made up",
+        rows=tuple(
+            Row(
+                arch=Arch(c=c, stages=stages, semantic=True, refinement=level == 2),
+                precision="int8",
+                d1_all=loss(c, stages, level),
+                epe=-0.01,
+                miou=-0.5,
+                pacc=0.25,
+            )
+            for c, stages, level in product((1, 8), (1, 2, 3), (1, 2))
+        ),
+    )
+)
+"""int8 judged with semantics, at c = 1 and 8: EPE and pixel accuracy got better by chance."""
 
 
 def question(device: str = "tx2", target_fps: float = 10.0, **others: Any) -> Question:
@@ -128,8 +158,10 @@ class Loop:
         """Those that may enter the front, and how many were left out for which reason."""
         eligible, left_out = [], Counter[str]()
         for arch in archs(self.space):
-            known, exact, extrapolated = accuracy(arch, self.source)
             for executor in executors(self.asked.profile):
+                known, exact, extrapolated = accuracy(arch, self.source)
+                if executor.precision == "int8":
+                    known, extrapolated = self.in_integers(arch, known, extrapolated)
                 reason = self.reason(arch, executor, known)
                 if reason:
                     left_out[reason] += 1
@@ -142,6 +174,22 @@ class Loop:
                 eligible.append(Candidate(arch, *names, latency, half, known, timed, evidence))
         return eligible, left_out
 
+    def in_integers(
+        self, arch: Arch, known: tuple[float | None, ...], extrapolated: bool
+    ) -> tuple[tuple[float | None, ...], bool]:
+        """What was known in fp32, and what int8 costs: between c = 1 and 8, linear in log2(c)."""
+        level = BRANCHES.index(arch.branches)
+        if not level:
+            return (None,) * len(known), True
+        low, high = (loss(c, arch.stages, level) for c in (1, 8))
+        share = min(log(arch.c) / log(8), 1.0)
+        changes = {"d1_all": low + share * (high - low), "epe": 0.0, "miou": -0.5, "pacc": 0.0}
+        found = tuple(
+            None if value is None else value + changes[metric]
+            for metric, value in zip(METRICS, known, strict=True)
+        )
+        return found, extrapolated or not 1 <= arch.c <= 8
+
     def reason(self, arch: Arch, executor: Executor, known: tuple[float | None, ...]) -> str | None:
         asked = self.asked
         size = weights(arch) * {"fp32": 4, "fp16": 2, "int8": 1}[executor.precision]
@@ -151,8 +199,6 @@ class Loop:
             return "d_max"
         if size > asked.max_size_bytes:
             return "--max-size-mb"
-        if executor.precision == "int8":
-            return "is known in int8"
         if known[METRICS.index(asked.objective)] is None:
             usual = arch.conv3d == (16, 4, 4)[: arch.stages]
             return "stages and branches" if usual else "3D widths"
@@ -276,7 +322,7 @@ def test_the_search_is_the_loop(name: str) -> None:
         and (not asked.runtimes or one.runtime in asked.runtimes)
     ]
     expected = {one.key: one for one in Loop(asked).front(chosen)}
-    found = search(asked, PUBLISHED, SMALL)
+    found = search(asked, PUBLISHED, SMALL, LOSSES)
     assert {(p.arch, p.runtime, p.precision) for p in found.front} == expected.keys()
     assert len(found.front) == len(expected)
     for point in found.front:
@@ -568,7 +614,9 @@ def test_a_profile_by_parts_gives_every_network_of_a_block_its_latency(
     (executor,) = _executors(asked)
     totals = _Totals(space)
     for stages in space.stages:
-        block = _Block(space, asked, executor, PUBLISHED.columns(space, stages), totals, stages)
+        block = _Block(
+            space, asked, executor, PUBLISHED.columns(space, stages), True, totals, stages
+        )
         latency, evidence = block._latency()
         for arch in (arch for arch in archs(space) if arch.stages == stages):
             position = space.position(arch)
@@ -594,7 +642,7 @@ def test_runtimes_and_precisions_of_one_profile_compete(two_runtimes: Profile) -
     """All are candidates; of bf16 no accuracy is known. The front of both is what remains of the
     fronts of each.
     """
-    found = search(Question(two_runtimes, 1), PUBLISHED, USUAL)
+    found = search(Question(two_runtimes, 1), PUBLISHED, USUAL, NOTHING)
     assert found.space.size == 3 * USUAL.size()
     assert {(p.runtime, p.precision) for p in found.front} == {
         ("onnxruntime", "fp32"),
@@ -646,8 +694,8 @@ def test_a_runtime_that_the_device_lacks_is_refused_with_what_it_has() -> None:
     assert "int8" not in str(refusal.value)
 
 
-def test_int8_has_no_accuracy_that_anyone_knows() -> None:
-    found = search(question("rtx2080ti", precisions=("int8",)), PUBLISHED, SMALL)
+def test_a_precision_that_nobody_judged_is_left_out() -> None:
+    found = search(question("rtx2080ti", precisions=("int8",)), PUBLISHED, SMALL, NOTHING)
     assert found.front == ()
     assert (found.selected, found.prospect, found.nearest) == (None, None, None)
     assert sum(entry.count for entry in found.left_out) == found.space.size == 378

@@ -92,7 +92,7 @@ def test_evidence_has_markers_of_its_own() -> None:
 
 
 def test_each_runtime_and_precision_has_a_colour_and_is_named(two_runtimes: Profile) -> None:
-    result = search(Question(two_runtimes, 10.0), source("published"), SMALL)
+    result = search(Question(two_runtimes, 10.0, precisions=("fp32",)), source("published"), SMALL)
     (axes,) = draw(result, "My PC").axes
     colours: dict[str, set[str]] = {}
     for line in axes.get_lines():
