@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
-from ..model.arch import Precision
 from ..model.box import named_model
 from ..model.bundle import graph_of
 from ..model.console import (
@@ -24,32 +22,15 @@ from ..model.console import (
     screen,
     seed,
 )
-from ..model.data.catalog import STREETS, open_dataset
-from ..model.data.scene import Sample
+from ..model.data.catalog import STREETS
 from ..model.errors import UsageError
-from ..model.files import existing_file, output_folder, remove, write_bytes, write_json
+from ..model.files import existing_file, output_folder
 from ..model.machine import cores
 from ..profiles.profile import Profile, load, names
 
 if TYPE_CHECKING:
-    from .budget import Budget
     from .report import Metrics, Report, Row
-    from .source import Source
-
-FLOAT, REPORT, PAGE, PICTURE = "fp32.onnx", "quantize.json", "report.html", "audit.png"
-CACHE: Final = "calibration.npz"
-
-MADE: Final = (
-    "int8.onnx",
-    "fp16.onnx",
-    "openvino.xml",
-    "openvino.bin",
-    FLOAT,
-    PAGE,
-    PICTURE,
-    REPORT,
-)
-"""What an earlier run may have left, and a later one with another outcome does not write."""
+    from .run import Order
 
 HERE: Final = "cpu"
 """The device of int8 and bf16 unless told: the machine at hand."""
@@ -57,32 +38,18 @@ HERE: Final = "cpu"
 PAIRS: Final = 32
 """How many pairs calibrate unless told."""
 
-JUDGED: Final = 20
-"""How many streets judge."""
-
-SHOWN: Final = 3
-"""How many frames the page shows."""
-
-TARGET: Final = (
-    "rounded to fp16 after every operator, as a target with fp16 units does; fp16.onnx is for "
-    "TensorRT and CUDA: ONNX Runtime on a CPU runs it through casts, no faster than fp32"
-)
-BY_RULES: Final = (
-    "the profile's rules decided, nothing was timed: build and time it on the device "
-    "(rts2-profile kit times networks there)"
-)
-
 
 @command
 def quantize(arguments: Sequence[str] | None = None) -> int:
     """The command rts2-quantize: a trained network in lower precision, measured."""
     options = _parser().parse_args(arguments)
     profile = _profile(options)
-    path = existing_file(graph_of(options.model), "a model (a checkpoint or an ONNX file)")
+    order = _order(options)
     out = output_folder(options.out)
+    from .run import Run
+
     with TemporaryDirectory(prefix="rts2.") as folder:
-        run = _Run(options, profile, path, out, Path(folder))
-        report = run.done()
+        report = Run(order, profile, out, Path(folder)).done()
     if options.json:
         print_json(report.to_json())
     else:
@@ -169,260 +136,23 @@ def _profile(options: argparse.Namespace) -> Profile | None:
     return profile
 
 
-class _Run:
-    """One quantization, from the options to the files; `folder` holds what lies in between."""
+def _order(options: argparse.Namespace) -> Order:
+    from .run import Order
+    from .source import Asked
 
-    def __init__(
-        self,
-        options: argparse.Namespace,
-        profile: Profile | None,
-        path: Path,
-        out: Path,
-        folder: Path,
-    ) -> None:
-        from .source import Asked, Source
-
-        self.options, self.profile, self.out, self.folder = options, profile, out, folder
-        asked = Asked(options.resolution, options.stages, self._opset(options, profile))
-        self.source: Source = Source(path, asked, folder)
-        self.precision: Precision = options.precision
-        self.frames = _opened(options.eval, self.source.resolution, "val", JUDGED, 0)
-        """What judges; streets come at the network's own size."""
-        self.threads = options.threads or cores()
-
-    @staticmethod
-    def _opset(options: argparse.Namespace, profile: Profile | None) -> int | None:
-        """What the device's importer reads, where the device is not at hand."""
-        if options.opset is not None or profile is None or profile.machine is not None:
-            given: int | None = options.opset
-            return given
-        told = [known.opset for known in profile.runtimes if known.opset is not None]
-        return min(told) if told and options.model.suffix.lower() != ".onnx" else None
-
-    def done(self) -> Report:
-        """Quantizes, judges, writes."""
-        here = self.profile is not None and self.profile.machine is not None
-        if self.precision == "int8":
-            return self._integers_here() if here else self._integers_by_rules()
-        return self._half_here() if here else self._half_for_target()
-
-    @property
-    def budget(self) -> Budget:
-        from .budget import HALF, INT8, Budget
-
-        usual = INT8 if self.precision == "int8" else HALF
-        given = self.options.max_d1_drop, self.options.max_miou_drop
-        return Budget(
-            usual.max_d1_drop if given[0] is None else given[0],
-            usual.max_miou_drop if given[1] is None else given[1],
-        )
-
-    def _integers_here(self) -> Report:
-        from .ptq import Setting, quantize
-        from .report import calibrated, in_forms, rows, trial
-
-        setting = Setting(
-            self.pairs,
-            self.frames,
-            self.budget,
-            self.options.method,
-            self.threads,
-            self.out / CACHE,
-            self.folder,
-        )
-        found = quantize(self.source, setting)
-        own = self.folder / "int8.onnx"
-        self._save(found.model, found.header, own)
-        report = self._timed(found, own, "ONNX Runtime", "fp32")
-        return self._written(
-            _with(
-                report,
-                layers=rows(found),
-                calibration=calibrated(found.calibration, setting.method, str(self.options.calib)),
-                forms=in_forms(found.float_forms, found.header.forms),
-                trials=tuple(map(trial, found.trials)),
-            ),
-            {FLOAT: found.parent, "int8.onnx": own} if found.delivered else {FLOAT: found.parent},
-        )
-
-    def _half_here(self) -> Report:
-        from .half import quantize
-        from .report import in_forms
-
-        found = quantize(self.source, self.precision, self.frames, self.budget, self.threads)
-        weights = found.graph.with_suffix(".bin")
-        report = self._timed(found, weights, "OpenVINO", "fp32 in ONNX Runtime")
-        files = {FLOAT: found.parent}
-        if found.delivered:
-            files |= {"openvino.xml": found.graph, "openvino.bin": found.graph.with_suffix(".bin")}
-        forms = in_forms(found.float_forms, found.header.forms)
-        return self._written(_with(report, forms=forms), files)
-
-    def _integers_by_rules(self) -> Report:
-        from .report import Report, calibrated, metrics, named, rows_by_rules
-        from .rules import quantize
-
-        assert self.profile is not None, "int8 is for a device"
-        found = quantize(
-            self.source,
-            self.pairs,
-            self.frames,
-            self.budget,
-            self.options.method,
-            self.out / CACHE,
-        )
-        own = self.folder / "int8.onnx"
-        self._save(found.model, found.header, own)
-        names = sorted({*found.kept, *found.chosen})
-        files = {FLOAT: found.parent, "int8.onnx": own} if found.within else {FLOAT: found.parent}
-        report = Report(
-            network=named(found.header),
-            precision=self.precision,
-            outcome="int8" if found.within else "fp32",
-            why=BY_RULES if found.within else "no choice of layers keeps the accuracy budget",
-            device=self.profile.name,
-            runtime="tensorrt",
-            evidence="rules",
-            machine=None,
-            measured_on=self.judged_on,
-            reference=metrics(found.measured.reference, found.parent.stat().st_size),
-            quantized=metrics(found.measured.other, own.stat().st_size, found.measured.sqnr_db),
-            budget=self.budget,
-            layers=rows_by_rules(names, found.kept, found.effects),
-            calibration=calibrated(found.calibration, self.options.method, str(self.options.calib)),
-        )
-        return self._written(report, files)
-
-    def _half_for_target(self) -> Report:
-        from .budget import drops
-        from .fp16 import emulated, kept_float, to_fp16
-        from .parity import measure
-        from .report import Report, Row, metrics, named
-        from .source import opened
-
-        if self.precision == "bf16":
-            raise UsageError("bf16 is for CPUs, through OpenVINO: give --device cpu, or fp16")
-        parent = self.source.graph(next(iter(self.source.forms), None))
-        model, header = opened(parent)
-        lowered = to_fp16(model)
-        header = header.model_copy(update={"precision": "fp16"})
-        own, rounded = self.folder / "fp16.onnx", self.folder / "emulated.onnx"
-        self._save(lowered, header, own)
-        self._save(emulated(lowered), header, rounded)
-        from ..model.predictor import OnnxPredictor
-
-        found = measure(OnnxPredictor(parent), OnnxPredictor(rounded), self._scenes())
-        drops(found)
-        within = self.budget.holds(found)
-        convs = [node.name for node in model.graph.node if node.op_type == "Conv"]
-        files = {FLOAT: parent, "fp16.onnx": own} if within else {FLOAT: parent}
-        report = Report(
-            network=named(header),
-            precision=self.precision,
-            outcome="fp16" if within else "fp32",
-            why=TARGET if within else "fp16 leaves the accuracy budget: fp32 is delivered",
-            device=None if self.profile is None else self.profile.name,
-            runtime="tensorrt",
-            evidence="rules",
-            machine=None,
-            measured_on=self.judged_on,
-            reference=metrics(found.reference, parent.stat().st_size),
-            quantized=metrics(found.other, own.stat().st_size, found.sqnr_db),
-            budget=self.budget,
-            layers=(
-                *(Row(name, "fp16", None) for name in convs),
-                *(Row(kept.layer, "fp32", kept.reason) for kept in kept_float(model)),
-            ),
-        )
-        return self._written(report, files)
-
-    def _timed(self, found: Any, own: Path, title: str, parent: str) -> Report:
-        """What a duel on this machine came to."""
-        from .report import Report, latencies, metrics, named, sentence
-
-        assert self.profile is not None, "what is timed is timed on a device"
-        measured, duel = found.measured, found.duel
-        before, after = latencies(duel)
-        return Report(
-            network=named(found.header),
-            precision=self.precision,
-            outcome=self.precision if found.delivered else "fp32",
-            why=sentence(found.delivered, self.precision, duel, found.within, parent),
-            device=self.profile.name,
-            runtime="onnxruntime" if title == "ONNX Runtime" else "openvino",
-            evidence="measured",
-            machine=self._machine(title),
-            measured_on=self.judged_on,
-            reference=metrics(measured.reference, found.parent.stat().st_size, latency_ms=before),
-            quantized=metrics(measured.other, own.stat().st_size, measured.sqnr_db, after),
-            budget=self.budget,
-            speedup=1 / duel.ratio,
-            speedup_error=duel.timing.error,
-        )
-
-    def _machine(self, title: str) -> str:
-        from ..profiles.here import this_machine
-
-        runtime = "onnxruntime" if title == "ONNX Runtime" else "openvino"
-        known = this_machine(runtime, self.threads)
-        return (
-            f"{known.processor}, {self.threads} threads, {title} {known.versions[runtime]}, "
-            f"{known.date}"
-        )
-
-    @cached_property
-    def pairs(self) -> Sequence[Sample]:
-        """What calibrates."""
-        options = self.options
-        return _opened(options.calib, self.source.resolution, "train", options.pairs, options.seed)[
-            : options.pairs
-        ]
-
-    @property
-    def judged_on(self) -> str:
-        """What judges, in words."""
-        return f"{len(self.frames)} frames of {self.options.eval}"
-
-    def _scenes(self) -> Iterator[Any]:
-        from ..model.console import progress
-
-        frames = self.frames
-        return (frame.read() for frame in progress(frames, "judging", len(frames)))
-
-    @staticmethod
-    def _save(model: Any, header: Any, path: Path) -> None:
-        from ..model.graph import save_graph
-
-        save_graph(model, header, path)
-
-    def _written(self, report: Report, files: dict[str, Path]) -> Report:
-        """The report with its files, all of them in the output folder."""
-        given = self.source.given
-        kept = {name: path for name, path in files.items() if not (given and name == FLOAT)}
-        for name, path in kept.items():
-            write_bytes(self.out / name, path.read_bytes())
-        for name in MADE:
-            if name not in kept:
-                remove(self.out / name)
-        complete = report.with_files([*kept, REPORT])
-        write_json(self.out / REPORT, complete.to_json())
-        return complete
-
-
-def _with(report: Report, **values: Any) -> Report:
-    from dataclasses import replace
-
-    return replace(report, **values)
-
-
-def _opened(
-    folder: Path, size: tuple[int, int], split: str, streets: int, seed: int
-) -> Sequence[Sample]:
-    """The pairs of a folder in any layout; for the streets their size, split, number and seed."""
-    if str(folder) == STREETS:
-        return open_dataset(STREETS, split=split, count=streets, size=size, seed=seed)
-    layout = "folder" if (folder / "left").is_dir() else "kitti2015"
-    return open_dataset(layout, folder)
+    return Order(
+        model=existing_file(graph_of(options.model), "a model (a checkpoint or an ONNX file)"),
+        precision=options.precision,
+        calib=options.calib,
+        pairs=options.pairs,
+        method=options.method,
+        judge=options.eval,
+        max_d1_drop=options.max_d1_drop,
+        max_miou_drop=options.max_miou_drop,
+        asked=Asked(options.resolution, options.stages, options.opset),
+        threads=options.threads or cores(),
+        seed=options.seed,
+    )
 
 
 def _show(report: Report, out: Path) -> None:

@@ -38,6 +38,8 @@ class Halved:
     """The float graph, in the form that ONNX Runtime runs fastest."""
     graph: Path
     """OpenVINO's own format (.xml, a .bin beside it), in the form that it runs fastest."""
+    predictor: OnnxPredictor
+    """The network as OpenVINO computes it."""
     header: GraphHeader
     float_forms: tuple[Form, ...] | None
     measured: Measured
@@ -79,17 +81,18 @@ def quantize(
         raise UsageError(f"this processor does not compute in {precision}; {instead}")
     graphs = {forms: source.graph(forms or None) for forms in source.forms or ((),)}
     plain = _fastest([Runner(path, "fp32") for path in graphs.values()], threads)
-    lowered = {path: path.with_suffix(".xml") for path in graphs.values()}
-    for path, other in lowered.items():
-        to_ir(path, other)
-    own = _fastest([Runner(other, precision, RUNTIME) for other in lowered.values()], threads)
-    graph = next(path for path, other in lowered.items() if other == own.path)
-    pair = OnnxPredictor(plain.path), OpenVinoPredictor(graph, own.path, precision, threads)
+    lowered = {path.with_suffix(".xml"): path for path in graphs.values()}
+    for compiled, path in lowered.items():
+        to_ir(path, compiled)
+    own = _fastest([Runner(compiled, precision, RUNTIME) for compiled in lowered], threads)
+    graph = lowered[own.path]
+    other = OpenVinoPredictor(graph, own.path, precision, threads)
     shown = progress(frames, "judging", len(frames))
-    measured = measure(*pair, (frame.read() for frame in shown))
+    measured = measure(OnnxPredictor(plain.path), other, (frame.read() for frame in shown))
     return Halved(
         plain.path,
         own.path,
+        other,
         opened(graph)[1],
         opened(plain.path)[1].forms,
         measured,

@@ -10,7 +10,6 @@ from typing import Any
 from ..model.arch import Form, Precision
 from ..model.graph import GraphHeader
 from ..model.metrics import Score
-from ..profiles.timing import Timing
 from .budget import Budget
 from .calibration import Calibration
 from .ptq import Quantized, Trial
@@ -84,9 +83,6 @@ class Report:
     def kept(self) -> tuple[Row, ...]:
         """What stays float of that which could be in another precision."""
         return tuple(row for row in self.layers if row.reason is not None)
-
-    def with_files(self, names: Sequence[str]) -> Report:
-        return replace(self, files=tuple(names))
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -229,9 +225,3 @@ def _reason(cost: Cost, found: Quantized) -> str:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and isfinite(value) else None
-
-
-def latencies(duel: Duel) -> tuple[float, float]:
-    """The parent's and the graph's own latency in ms, by the duel's ratio."""
-    timing: Timing = duel.timing
-    return timing.reference_ms, duel.own_ms

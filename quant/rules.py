@@ -49,6 +49,8 @@ class ByRules:
     model: onnx.ModelProto
     header: GraphHeader
     chosen: frozenset[str]
+    layers: tuple[str, ...]
+    """All of them, in the order of the graph."""
     kept: Mapping[str, str]
     """Layers that stay float, and why."""
     effects: Mapping[str, Effect]
@@ -95,6 +97,7 @@ def quantize(
         integers(model, chosen, ranges, symmetric=True),
         header.model_copy(update={"precision": "int8"}),
         chosen,
+        tuple(names),
         kept,
         effects,
         known,

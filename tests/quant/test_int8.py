@@ -13,7 +13,8 @@ from rts2.model.graph import load_graph, read_header, save_graph
 from rts2.model.predictor import open_model
 from rts2.model.qdq import layers
 from rts2.profiles.timing import Timing
-from rts2.quant import cli, ptq
+from rts2.quant import ptq
+from rts2.quant import run as running
 from rts2.quant.cli import quantize
 from rts2.quant.parity import synthetic_scene
 from rts2.quant.race import Duel, Runner
@@ -41,7 +42,7 @@ def won(ratio: float) -> Duel:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty streets would be judged in every test; three tell as much here."""
-    monkeypatch.setattr(cli, "JUDGED", 3)
+    monkeypatch.setattr(running, "JUDGED", 3)
 
 
 @pytest.fixture
