@@ -44,6 +44,24 @@ class Features(nn.Module):
         return found
 
 
+class SixConvs(nn.Sequential):
+    """Six pre-activated 3D convs over a volume, 1 → width → … → 1."""
+
+    def __init__(self, width: int) -> None:
+        widths = [1, *[width] * 5, 1]
+        super().__init__(
+            *(
+                preactivated(nn.Conv3d(inputs, outputs, 3, padding=1, bias=False))
+                for inputs, outputs in pairwise(widths)
+            )
+        )
+
+    def forward(self, volume: Tensor) -> Tensor:
+        """(B, planes, h, w) → the same."""
+        regular: Tensor = super().forward(volume.unsqueeze(1))
+        return regular.squeeze(1)
+
+
 class AnyNet(nn.Module):
     """The network of an `Arch` of family `anynet`.
 
@@ -56,7 +74,7 @@ class AnyNet(nn.Module):
         super().__init__()
         self.arch = arch
         self.features = Features(arch.c, arch.stages)
-        self.regularize = nn.ModuleList(_six_convs(width) for width in arch.conv3d)
+        self.regularize = nn.ModuleList(SixConvs(width) for width in arch.conv3d)
         self.matching: Matching = PLAIN
 
     def forward(self, left: Tensor, right: Tensor, stages: int | None = None) -> list[Stage]:
@@ -73,21 +91,11 @@ class AnyNet(nn.Module):
             else:
                 around = _resized(found[-1].disparity, features.shape[-2:]) / stride
                 volume = matching.residual_volume(left_features, right_features, around).flip(1)
-            volume = self.regularize[stage](volume.unsqueeze(1)).squeeze(1)
+            volume = self.regularize[stage](volume)
             step = matching.soft_argmin(volume, 0 if stage == 0 else -RADIUS) * stride
             disparity = _resized(step, size)
             found.append(Stage(disparity + found[-1].disparity if found else disparity))
         return found
-
-
-def _six_convs(width: int) -> nn.Sequential:
-    widths = [1, *[width] * 5, 1]
-    return nn.Sequential(
-        *(
-            preactivated(nn.Conv3d(inputs, outputs, 3, padding=1, bias=False))
-            for inputs, outputs in pairwise(widths)
-        )
-    )
 
 
 def _resized(maps: Tensor, size: torch.Size) -> Tensor:

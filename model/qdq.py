@@ -133,6 +133,7 @@ def integers(
         return model
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
+    _unshare(copy.graph)
     held = () if symmetric else _hold_back(copy, members)
     made = _quantizer(
         copy, members, _tensor_ranges({**ranges, **_below_zero(ranges, held)}), symmetric
@@ -167,6 +168,21 @@ def _quantizer(
             raise Rts2Error(f"the graph cannot be quantized: {error}") from error
     made: onnx.ModelProto = quantizer.model.model
     return made
+
+
+def _unshare(graph: onnx.GraphProto) -> None:
+    """Gives every convolution weights of its own: two equal biases are stored once, and one that is
+    quantized for another layer would no longer be a constant to this one.
+    """
+    tensors = {tensor.name: tensor for tensor in graph.initializer}
+    taken: set[str] = set()
+    for node in graph.node:
+        for index, name in enumerate(node.input):
+            if name in taken and node.op_type == LAYER:
+                own = graph.initializer.add()
+                own.CopyFrom(tensors[name])
+                own.name = node.input[index] = f"{name}:{node.name}"
+        taken |= tensors.keys() & set(node.input)
 
 
 def _hold_back(model: onnx.ModelProto, members: Collection[str]) -> tuple[str, ...]:

@@ -55,9 +55,9 @@ class Source:
     @cached_property
     def forms(self) -> tuple[tuple[Form, ...], ...]:
         """The forms that its graph can take, the same one for all stages; none where it has one."""
-        if self.given or self.network.arch.family != "rts2net":
+        if self.given:
             return ()
-        stages = self.network.arch.stages
+        stages = self.network.arch.stages  # an export may run fewer of them
         return tuple((form,) * stages for form in get_args(Form))
 
     def graph(self, forms: Sequence[Form] | None = None) -> Path:

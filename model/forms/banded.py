@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from ..arch import Form
 from ..checkpoint import Network
 from ..errors import UsageError
-from ..rts2net import Regularization, RTS2Net
+from ..rts2net import Regularization
 
 Formed = TypeVar("Formed", bound=Network)
 
@@ -54,16 +54,21 @@ def formed(network: Formed, forms: Sequence[Form] | None) -> Formed:
     `forms` has one entry for each stage of the network's arch; None or nothing means "3d" for all.
 
     Raises:
-        UsageError: the network is no RTS2Net, or there is not one known form per stage.
+        UsageError: there is not one known form per stage.
     """
     copy = deepcopy(network)
     copy.eval()
     if forms:
         _check(network, forms)
         for stage, form in enumerate(forms):
-            volume = copy.regularize[stage]
-            if form == "banded" and isinstance(volume, Regularization):
-                copy.regularize[stage] = Banded(volume, copy.arch.planes(stage))
+            if form == "banded":
+                volume, planes = copy.regularize[stage], copy.arch.planes(stage)
+                # AnyNet's regressions are no part of its volumes.
+                copy.regularize[stage] = (
+                    Banded(volume, planes)
+                    if isinstance(volume, Regularization)
+                    else _flat(volume, planes).eval()
+                )
     return copy
 
 
@@ -75,9 +80,6 @@ def forms_run(forms: Sequence[Form] | None, stages: int) -> tuple[Form, ...] | N
 
 def _check(network: Network, forms: Sequence[Form]) -> None:
     given, known = ", ".join(map(str, forms)), get_args(Form)
-    if not isinstance(network, RTS2Net):
-        family = network.arch.family
-        raise UsageError(f"only the rts2net family has forms, not {family}; leave out {given}")
     unknown = [form for form in forms if form not in known]
     if unknown:
         raise UsageError(f"a form must be {' or '.join(known)}, not {unknown[0]}")
@@ -90,7 +92,9 @@ def _check(network: Network, forms: Sequence[Form]) -> None:
 
 
 def _flat(layer: nn.Module, planes: int) -> nn.Module:
-    """One layer over (channels, planes) as a layer over channels·planes."""
+    """One layer, or a chain of them, over (channels, planes) as one over channels·planes."""
+    if isinstance(layer, nn.Sequential):
+        return nn.Sequential(*(_flat(each, planes) for each in layer))
     if isinstance(layer, nn.Conv3d):
         return _flat_conv(layer, planes)
     return _flat_norm(layer, planes) if isinstance(layer, nn.BatchNorm3d) else deepcopy(layer)

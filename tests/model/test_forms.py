@@ -90,8 +90,9 @@ def test_a_formed_network_is_a_copy_in_the_forms_asked_for(lively: Lively) -> No
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
-def test_a_formed_network_says_the_same_at_every_stage(lively: Lively) -> None:
-    network = lively(build(SMALL)).double()
+@pytest.mark.parametrize("arch", [SMALL, Arch(family="anynet", c=2, d_max=5, conv3d=(3, 1, 2))])
+def test_a_formed_network_says_the_same_at_every_stage(lively: Lively, arch: Arch) -> None:
+    network = lively(build(arch)).double()
     left, right = torch.randn(2, 2, 3, 64, 96, dtype=torch.float64)
     with torch.inference_mode():
         answers = [net(left, right) for net in (network, formed(network, ["banded"] * 3))]
@@ -201,7 +202,6 @@ def test_a_file_without_forms_is_one_of_before(tmp_path: Path) -> None:
         (Arch(c=1, stages=2), ["banded"], "forms: forms must be one per stage, 2 in all"),
         (Arch(c=1, stages=2), [], "forms: forms must be one per stage, 2 in all"),
         (Arch(c=1, stages=1), ["2d"], r"forms\.0: Input should be '3d' or 'banded'"),
-        (Arch(family="anynet", c=1, stages=1), ["3d"], "forms: the anynet family has none"),
     ],
 )
 def test_wrong_forms_in_a_header_are_refused(
@@ -231,11 +231,6 @@ def test_wrong_forms_in_a_header_are_refused(
             "forms must be one for each stage of the network, 1 in all, not 2: 3d, banded",
         ),
         (Arch(c=1, stages=2), ["3d", "2d"], "a form must be 3d or banded, not 2d"),
-        (
-            Arch(family="anynet", c=1),
-            ["banded"] * 3,
-            "only the rts2net family has forms, not anynet; leave out banded, banded, banded",
-        ),
     ],
 )
 def test_wrong_forms_are_wrong_use(

@@ -166,3 +166,19 @@ def test_a_quantization_does_not_pass_a_pooling_in_float(exported: onnx.ModelPro
     assert order == ["Relu", "MaxPool"]
     wanted = answers(exported)
     assert np.abs(answers(made) - wanted).mean() < 0.05 * np.abs(wanted).mean()
+
+
+def test_a_bias_that_two_layers_share_stays_a_constant_of_the_one_in_float(
+    exported: onnx.ModelProto,
+) -> None:
+    """Untrained norms leave biases of zero, and equal tensors are stored once."""
+    convs = {node.name: node for node in exported.graph.node if node.op_type == "Conv"}
+    biases = [conv.input[2] for conv in convs.values()]
+    shared = {name for name in biases if biases.count(name) > 1}
+    assert shared
+    chosen = usual(exported)
+    made = integers(exported, chosen, nominal(exported))
+    constants = {tensor.name for tensor in made.graph.initializer}
+    for node in made.graph.node:
+        if node.op_type == "Conv" and node.name not in chosen:
+            assert set(node.input[1:]) <= constants, node.name
