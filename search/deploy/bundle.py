@@ -68,12 +68,13 @@ python3 check.py
 
 
 TARGETS: dict[str, Target] = {
-    "onnxruntime": Target("measured_onnxruntime.py", {"fp32": 0.01}),
+    "onnxruntime": Target("measured_onnxruntime.py", {"fp32": 0.01, "int8": 0.5}),
     "openvino": Target("measured_openvino.py", {"fp32": 0.01, "bf16": 1.0, "fp16": 0.1}),
     "tensorrt": Target("measured_tensorrt.py", {"fp32": 0.1, "fp16": 0.1}, build=trtexec),
 }
 """How a bundle runs, by runtime. Beside half precision, TensorRT's tolerance allows for TF32; of a
-disparity above 128 pixels the last bit of bf16 is a pixel."""
+disparity above 128 pixels the last bit of bf16 is a pixel. Integers are held against ONNX Runtime's
+own answer, and processors without their instructions round differently."""
 
 
 def runtime_of(profile: Profile, asked: Runtime | None = None) -> RuntimeSupport:
@@ -106,7 +107,7 @@ def write(
     if deployment.precision not in target.tolerance_px:
         raise UsageError(
             f"a bundle for {profile.title} runs {' or '.join(target.tolerance_px)} on "
-            f"{support.runtime}, not {deployment.precision}"
+            f"{support.runtime}, not {deployment.precision}; rts2-quantize makes such a graph"
         )
     model = folder / MODEL
     sample = _sample(deployment)
@@ -165,10 +166,13 @@ def _export(
     path: Path,
     sample: tuple[Floats, Floats],
 ) -> Floats:
-    """Writes the graph, checks it, and returns PyTorch's disparity of the sample."""
+    """Writes the graph, checks it, and returns PyTorch's disparity of the sample, or that of the
+    graph itself where it is one of integers.
+    """
     import torch
 
     from ...model.export import OPSET, Deployed, export, parity
+    from .integers import answer, lower
 
     opset = support.opset or OPSET
     resolution, forms = deployment.input.resolution, deployment.forms
@@ -181,6 +185,9 @@ def _export(
             f"the exported graph differs from its network by {found.disparity_px:.2g} px, and "
             f"{TOLERANCE_PX:g} px is allowed; check the checkpoint for extreme weights"
         )
+    if deployment.precision == "int8":
+        lower(path)
+        return answer(path, *sample)
     with torch.inference_mode():
         disparity: Floats = Deployed(network).eval()(left, right)[0].numpy()
     return disparity

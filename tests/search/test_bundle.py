@@ -249,7 +249,7 @@ def test_half_precision_is_built_exactly_where_it_was_asked_for(precision: Preci
 
 
 @pytest.mark.parametrize(
-    ("device", "precision"), [("cpu", "int8"), ("cpu", "fp16"), ("tx2", "int8")]
+    ("device", "precision"), [("cpu", "bf16"), ("cpu", "fp16"), ("tx2", "int8")]
 )
 def test_a_precision_that_the_bundle_cannot_run_is_refused(
     tmp_path: Path, device: str, precision: Precision
@@ -535,3 +535,25 @@ def test_a_graph_that_is_not_its_network_is_refused(
     with pytest.raises(Rts2Error, match="differs from its network") as error:
         write(build(SMALL), asked(profile, "onnxruntime", "fp32"), profile, "trained", tmp_path)
     assert error.value.exit_code == 1
+
+
+def test_a_bundle_in_integers_runs_and_says_what_it_was_asked_to(tmp_path: Path) -> None:
+    """Its usual layers in 8 bits, checked against its own answer; the float network is near."""
+    profile = load("cpu")
+    folders = [tmp_path / name for name in ("int8", "again", "fp32")]
+    for folder in folders:
+        folder.mkdir()
+        torch.manual_seed(0)
+        precision: Precision = "fp32" if folder.name == "fp32" else "int8"
+        write(build(SMALL), asked(profile, "onnxruntime", precision), profile, "untrained", folder)
+    assert read_header(folders[0] / "model.onnx").precision == "int8"
+    _, kinds = operators(folders[0] / "model.onnx")
+    assert {"QuantizeLinear", "DequantizeLinear"} <= set(kinds)
+    for name in names(folders[0]):
+        assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes()
+    ended = checked(folders[0])
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    integers, floats = (
+        np.fromfile(folder / "sample_disparity.bin", "<f4") for folder in (folders[0], folders[2])
+    )
+    assert 0 < np.abs(integers - floats).mean() < 5
