@@ -58,7 +58,9 @@ class SixConvs(nn.Sequential):
 
     def forward(self, volume: Tensor) -> Tensor:
         """(B, planes, h, w) → the same."""
-        regular: Tensor = super().forward(volume.unsqueeze(1))
+        regular = volume.unsqueeze(1)
+        for block in self:
+            regular = block(regular)
         return regular.squeeze(1)
 
 
