@@ -165,6 +165,16 @@ def seed(text: str) -> int:
     return int(text)
 
 
+def whole_between(text: str, least: int, most: int) -> int:
+    """A whole number, as an option type."""
+    digits = text.isascii() and text.isdigit() and len(text) <= 20
+    if not (digits and least <= int(text) <= most):
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from {least} to {most}, not {text!r}"
+        )
+    return int(text)
+
+
 def resolution(text: str) -> tuple[int, int]:
     """`WxH` in pixels, as an option type."""
     parts = text.lower().split("x")

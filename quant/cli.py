@@ -21,6 +21,7 @@ from ..model.console import (
     resolution,
     screen,
     seed,
+    whole_between,
 )
 from ..model.data.catalog import STREETS
 from ..model.errors import UsageError
@@ -105,9 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 100_000):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 100000, not {text!r}")
-    return int(text)
+    return whole_between(text, 1, 100_000)
 
 
 def _points(text: str) -> float:
@@ -190,13 +189,12 @@ def _metrics(report: Report) -> Any:
 
 
 def _row(metrics: Metrics) -> list[str]:
-    size = None if metrics.size_bytes is None else metrics.size_bytes / 1000
     figures = (
         (metrics.latency_ms, 1),
         (metrics.d1_all, 2),
         (metrics.epe, 3),
         (metrics.miou, 2),
-        (size, 0),
+        (metrics.size_bytes / 1000, 0),
         (metrics.sqnr_db, 1),
     )
     return [figure(value, digits) for value, digits in figures]

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ..arch import Arch, arch_from
 from ..box import SHIPPED, named_model
-from ..console import add_output, command, parser, positive, print_json, progress, resolution, seed
+from ..console import (
+    add_output,
+    command,
+    parser,
+    positive,
+    print_json,
+    progress,
+    resolution,
+    seed,
+    whole_between,
+)
 from ..data.catalog import DATASETS, require_generated
 from ..errors import Rts2Error, UsageError
 from ..files import existing_file, parse_json, read_json, sha256
@@ -342,25 +352,15 @@ def _add_setting(command: argparse.ArgumentParser) -> None:
 
 
 def _whole(text: str) -> int:
-    return _between(text, 1, MOST)
+    return whole_between(text, 1, MOST)
 
 
 def _threads(text: str) -> int:
-    return _between(text, 1, MOST_THREADS)
+    return whole_between(text, 1, MOST_THREADS)
 
 
 def _workers_given(text: str) -> int:
-    return _between(text, 0, MOST_THREADS)
-
-
-def _between(text: str, least: int, most: int) -> int:
-    """A whole number, as an option type."""
-    digits = text.isascii() and text.isdigit() and len(text) <= 20
-    if not (digits and least <= int(text) <= most):
-        raise argparse.ArgumentTypeError(
-            f"must be a whole number from {least} to {most}, not {text!r}"
-        )
-    return int(text)
+    return whole_between(text, 0, MOST_THREADS)
 
 
 def _report(options: argparse.Namespace, recipe: Recipe, finished: Finished) -> None:
