@@ -179,14 +179,14 @@ class Published:
     def _by_c(self, cs: Sequence[int], metric: Metric) -> Floats:
         """The metric of three-stage networks, (variants, c)."""
         least, _, most = BRANCHES
-        low, high = (self._over_c(cs, self._pairs(b, metric)) for b in (least, most))
+        low, high = (over_c(cs, self._pairs(b, metric)) for b in (least, most))
         return np.stack([low, low + (high - low) * self._share(metric), high])
 
     def _share(self, metric: Metric) -> float:
         """How far from disparity alone to the full network the variant between them lies."""
         least, between, most = BRANCHES
         cs, values = np.array(self._pairs(between, metric)).T
-        low, high = (self._over_c(cs, self._pairs(b, metric)) for b in (least, most))
+        low, high = (over_c(cs, self._pairs(b, metric)) for b in (least, most))
         return float(np.mean((values - low) / (high - low)))
 
     def _stage_ratio(self, cs: Sequence[int], stages: int, metric: Metric) -> Floats | float:
@@ -199,7 +199,7 @@ class Published:
             whole = dict(self._pairs(row.arch.branches, metric)).get(row.arch.c)
             if value is not None and whole is not None:
                 pairs.append((row.arch.c, value / whole))
-        return self._over_c(cs, pairs)
+        return over_c(cs, pairs)
 
     def _lost(self, d_maxs: Sequence[int], metric: Metric) -> Floats:
         """What a first volume of each size loses against the paper's, (d_max,)."""
@@ -221,15 +221,6 @@ class Published:
             and (value := row.value(metric)) is not None
         ]
 
-    @staticmethod
-    def _over_c(cs: Sequence[int] | Floats, pairs: Iterable[tuple[int, float]]) -> Floats:
-        """Linear in log2(c) between the pairs, constant beyond; NaN without any."""
-        known = sorted(pairs)
-        if not known:
-            return np.full(len(cs), np.nan)
-        xs, ys = zip(*known, strict=True)
-        return np.asarray(np.interp(np.log2(cs), np.log2(xs), ys))
-
 
 @dataclass(frozen=True)
 class Measured:
@@ -248,6 +239,15 @@ class Measured:
         metrics: dict[Metric, Floats] = {m: np.full(shape, np.nan) for m in METRICS}
         exact = _mark_rows(space, stages, self.table.rows, metrics)
         return Accuracy(metrics, exact, np.zeros(shape, dtype=bool))
+
+
+def over_c(cs: Sequence[int] | Floats, pairs: Iterable[tuple[int, float]]) -> Floats:
+    """Linear in log2(c) between the pairs, constant beyond; NaN without any."""
+    known = sorted(pairs)
+    if not known:
+        return np.full(len(cs), np.nan)
+    xs, ys = zip(*known, strict=True)
+    return np.asarray(np.interp(np.log2(cs), np.log2(xs), ys))
 
 
 def _mark_rows(

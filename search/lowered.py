@@ -20,7 +20,7 @@ from ..model.arch import Arch, Branches, Precision
 from ..model.files import parse_json
 from ..profiles.evidence import BRANCHES
 from ..profiles.latency import Floats
-from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, Metric
+from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, Metric, over_c
 from .space import Space
 
 KEEPS_ACCURACY: tuple[Precision, ...] = ("fp32", "fp16")
@@ -94,17 +94,15 @@ class Lowered:
         self, cs: Sequence[int], stages: int, precision: Precision, metric: Metric
     ) -> Floats:
         """(variants, c)"""
-        found = np.full((len(BRANCHES), len(cs)), np.nan)
-        for level, branches in enumerate(BRANCHES):
-            known = [
+        known = (
+            (
                 (row.arch.c, change)
                 for row in self._of(precision, stages, branches)
                 if (change := row.change(metric)) is not None
-            ]
-            if known:
-                xs, ys = zip(*sorted(known), strict=True)
-                found[level] = np.interp(np.log2(cs), np.log2(xs), ys)
-        return found
+            )
+            for branches in BRANCHES
+        )
+        return np.stack([over_c(cs, pairs) for pairs in known])
 
     def _inside(self, cs: Sequence[int], stages: int, precision: Precision) -> NDArray[np.bool_]:
         """Which lie between rows, (variants, c)."""
