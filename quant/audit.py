@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -12,7 +12,7 @@ import onnx
 
 from ..model.graph import GraphHeader, save_graph
 from ..model.qdq import PAIR, Flow, Layer, Ranges, flows, integers, layers
-from .selection import Cost, checkered
+from .selection import Cost, checkered, converted, total_ms
 
 if TYPE_CHECKING:
     from ..profiles.runtimes.attribution import Kernel
@@ -82,21 +82,22 @@ class Audit:
 
 def _conversion(
     costs: Sequence[Cost],
-    flowing: Iterable[Flow],
-    chosen: Collection[str],
+    flowing: Sequence[Flow],
+    chosen: frozenset[str],
     plain: Kernels,
     mixed: Kernels,
 ) -> float:
     """What the mixed graph takes beyond its layers, by the number of what it converts."""
-    shared = plain.total_ms - sum(cost.float_ms for cost in costs)
-    own = sum(cost.integer_ms if cost.layer in chosen else cost.float_ms for cost in costs)
-    elements = sum(f.elements for f in flowing if (f.giver in chosen) != (f.taker in chosen))
+    shared = plain.total_ms - total_ms(costs, (), 0.0, frozenset())
+    own = total_ms(costs, (), 0.0, chosen)
+    elements = converted(flowing, chosen)
     return max(mixed.total_ms - shared - own, 0.0) / elements if elements else 0.0
 
 
 def _by_layer(found: Sequence[Kernel], model: onnx.ModelProto) -> Kernels:
-    owner = _owners(layers(model))
-    ms: dict[str, float] = dict.fromkeys((layer.name for layer in layers(model)), 0.0)
+    known = layers(model)
+    owner = _owners(known)
+    ms: dict[str, float] = dict.fromkeys((layer.name for layer in known), 0.0)
     kinds: dict[str, dict[str, None]] = defaultdict(dict)
     for kernel in found:
         layer = _owner(kernel.origin.node, owner)
@@ -128,7 +129,8 @@ def _owner(node: str, owner: Mapping[str, str]) -> str | None:
     """The layer that a node of a graph with integers works for; None for what is no layer's."""
     if node in owner:
         return owner[node]
-    weightless = node.partition(":onnx::")[0]  # what quantizes a weight bears its layer's name
+    value = node
     for kind in PAIR:
-        weightless = weightless.removesuffix(f"_{kind}")
-    return owner.get(weightless)
+        value = value.removesuffix(f"_{kind}")
+    # What quantizes a weight bears its layer's name in front.
+    return owner.get(value) or owner.get(node.partition(":")[0])

@@ -136,6 +136,11 @@ class Calibration:
         """From where to where the integers of each value should reach."""
         return {name: known.range(method) for name, known in self.histograms.items()}
 
+    def first(self, samples: Sequence[Sample], count: int) -> list[Scene]:
+        """The first pairs that were seen, read again."""
+        named = {sample.name: sample for sample in samples}
+        return [named[name].read() for name in self.pairs[:count]]
+
     def mean(self, value: str) -> NDArray[np.float64]:
         """The mean of each channel of a value over all pairs."""
         return self.means[value] / len(self.pairs)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.arch import Form, Precision
-from ..model.console import progress
 from ..model.data.scene import Sample
 from ..model.errors import UsageError
 from ..model.graph import GraphHeader
@@ -23,7 +22,7 @@ from ..model.predictor import OnnxPredictor
 from ..profiles.runtimes import precisions
 from .budget import Budget
 from .intermediate import to_ir
-from .parity import Measured, measure
+from .parity import Measured, judge
 from .race import Duel, Runner, duel, race
 from .source import Source, opened
 
@@ -87,8 +86,7 @@ def quantize(
     own = _fastest([Runner(compiled, precision, RUNTIME) for compiled in lowered], threads)
     graph = lowered[own.path]
     other = OpenVinoPredictor(graph, own.path, precision, threads)
-    shown = progress(frames, "judging", len(frames))
-    measured = measure(OnnxPredictor(plain.path), other, (frame.read() for frame in shown))
+    measured = judge(OnnxPredictor(plain.path), other, frames)
     return Halved(
         plain.path,
         own.path,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.data.scene import Scene
+from ..model.console import progress
+from ..model.data.scene import Sample, Scene
 from ..model.errors import Rts2Error
 from ..model.evaluation import score
 from ..model.metrics import Score
@@ -50,6 +51,12 @@ def measure(reference: Predictor, other: Predictor, scenes: Iterable[Scene]) -> 
         for index, (model, estimate) in enumerate(zip((reference, other), estimates, strict=True)):
             scores[index] += score(estimate, scene, model.arch)
     return Measured(scores[0], scores[1], decibels(*total))
+
+
+def judge(reference: Predictor, other: Predictor, frames: Sequence[Sample]) -> Measured:
+    """`measure` on frames of a data set, read one after the other, with a bar on a terminal."""
+    shown = progress(frames, "judging", len(frames))
+    return measure(reference, other, (frame.read() for frame in shown))
 
 
 def synthetic_scene(resolution: tuple[int, int]) -> Scene:

@@ -23,7 +23,7 @@ import onnx
 
 from ..model.arch import Form
 from ..model.console import progress
-from ..model.data.scene import Sample, Scene
+from ..model.data.scene import Sample
 from ..model.graph import GraphHeader, save_graph
 from ..model.predictor import OnnxPredictor
 from ..model.qdq import integers, layers, nominal
@@ -31,14 +31,11 @@ from .audit import Audit, Audited
 from .bias import corrected
 from .budget import Budget, dearer, first_within
 from .calibration import Calibration, Method, calibrate
-from .parity import Measured, measure
+from .parity import Measured, judge
 from .race import Duel, Runner, duel, race
 from .selection import cheapest, total_ms
-from .sensitivity import Effect, Reference, alone
+from .sensitivity import AUDITED_PAIRS, Effect, Reference, alone
 from .source import Source, opened
-
-AUDITED_PAIRS: Final = 2
-"""Of the calibration, on which each layer's effect alone is judged."""
 
 CONVERSIONS: Final = (0.0, 0.5, 1.0, 2.0, 4.0)
 """What a conversion is taken to cost, in multiples of what it does on average: one cheapest choice
@@ -135,7 +132,8 @@ class _Quantization:
         known = calibrate(self.model, self.header, setting.pairs, setting.cache)
         self.ranges = known.ranges(setting.method)
         self.audited = self.audit.of(self.model, self.ranges)
-        self.reference = Reference(self.model, self.header, self._audited_scenes(known))
+        scenes = known.first(setting.pairs, AUDITED_PAIRS)
+        self.reference = Reference(self.model, self.header, scenes)
         names = [layer.name for layer in layers(self.model)]
         self.effects = alone(self.model, names, self.ranges, self.reference)
         fastest = self._fastest()
@@ -178,10 +176,6 @@ class _Quantization:
         """The kernels of one form; how long they take does not depend on the ranges."""
         model, _ = opened(self.source.graph(forms))
         return self.audit.of(model, nominal(model))
-
-    def _audited_scenes(self, known: Calibration) -> list[Scene]:
-        named = {sample.name: sample for sample in self.setting.pairs}
-        return [named[name].read() for name in known.pairs[:AUDITED_PAIRS]]
 
     def _fastest(self) -> frozenset[str]:
         """The fastest choice of those that should be, by a race."""
@@ -235,10 +229,8 @@ class _Quantization:
 
     def _judged(self, chosen: frozenset[str]) -> Measured:
         """The parent and a choice on the frames."""
-        frames = self.setting.frames
         pair = OnnxPredictor(self.parent), OnnxPredictor.of(self._made(chosen))
-        scenes = (frame.read() for frame in progress(frames, "judging", len(frames)))
-        found = measure(*pair, scenes)
+        found = judge(*pair, self.setting.frames)
         self.trials.append(
             Trial("judged", len(chosen), None, found, self.setting.budget.holds(found))
         )

@@ -16,16 +16,15 @@ from typing import Final
 
 import onnx
 
-from ..model.console import progress
 from ..model.data.scene import Sample
 from ..model.graph import GraphHeader
 from ..model.predictor import OnnxPredictor
 from ..model.qdq import integers, layers
 from .budget import Budget, dearer, first_within
 from .calibration import Calibration, Method, calibrate
-from .parity import Measured, measure
+from .parity import Measured, judge
 from .selection import Cost
-from .sensitivity import Effect, Reference, alone
+from .sensitivity import AUDITED_PAIRS, Effect, Reference, alone
 from .source import Source, opened
 
 KEPT: Final = (
@@ -37,8 +36,6 @@ KEPT: Final = (
 
 UNKNOWN_MS: Final = 1.0
 """What every layer is taken to save alike, where nobody timed any."""
-
-AUDITED_PAIRS: Final = 2
 
 
 @dataclass(frozen=True)
@@ -78,14 +75,12 @@ def quantize(
     names = [layer.name for layer in layers(model)]
     kept = {name: why for name in names if (why := _rule(name)) is not None}
     free = frozenset(name for name in names if name not in kept)
-    named = {sample.name: sample for sample in pairs}
-    scenes = [named[name].read() for name in known.pairs[:AUDITED_PAIRS]]
-    effects = alone(model, sorted(free), ranges, Reference(model, header, scenes))
+    reference = Reference(model, header, known.first(pairs, AUDITED_PAIRS))
+    effects = alone(model, sorted(free), ranges, reference)
 
     def judged(chosen: frozenset[str]) -> Measured:
         made = integers(model, chosen, ranges, symmetric=True)
-        shown = (frame.read() for frame in progress(frames, "judging", len(frames)))
-        return measure(OnnxPredictor(parent), OnnxPredictor.of(made), shown)
+        return judge(OnnxPredictor(parent), OnnxPredictor.of(made), frames)
 
     costs = [Cost(name, UNKNOWN_MS, 0.0) for name in names if name in free]
     errors = {name: effect.harm for name, effect in effects.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,9 +11,8 @@ from typing import Final
 from onnx import ModelProto
 
 from ..model.arch import Precision
-from ..model.console import progress
 from ..model.data.catalog import STREETS, open_dataset
-from ..model.data.scene import Sample, Scene
+from ..model.data.scene import Sample
 from ..model.errors import UsageError
 from ..model.files import remove, write_bytes, write_json
 from ..model.graph import GraphHeader, save_graph
@@ -26,7 +25,7 @@ from .calibration import Method
 from .fp16 import emulated, kept_float, to_fp16
 from .maps import Example
 from .page import EXAMPLES, page
-from .parity import Measured, measure
+from .parity import Measured, judge
 from .picture import save_audit
 from .race import Duel
 from .report import (
@@ -184,7 +183,7 @@ class Run:
         lowered = to_fp16(model)
         own = self._saved(lowered, header, "fp16.onnx")
         rounded = OnnxPredictor(self._saved(emulated(lowered), header, "emulated.onnx"))
-        found = measure(OnnxPredictor(parent), rounded, self._scenes())
+        found = judge(OnnxPredictor(parent), rounded, self.frames)
         drops(found)
         within = self.order.budget.holds(found)
         why = TARGET if within else "fp16 does not keep the accuracy budget: fp32 is delivered"
@@ -239,10 +238,6 @@ class Run:
             speedup=1 / duel.ratio,
             speedup_error=duel.timing.error,
         )
-
-    def _scenes(self) -> Iterator[Scene]:
-        frames = self.frames
-        return (frame.read() for frame in progress(frames, "judging", len(frames)))
 
     def _saved(self, model: ModelProto, header: GraphHeader, name: str) -> Path:
         save_graph(model, header, self.folder / name)

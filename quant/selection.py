@@ -60,9 +60,9 @@ def cheapest(
         capacity[index, sink] = _ticks(cost.integer_ms + ms_per_error * cost.error)
     for flow in flows:
         giver, taker = number[flow.giver], number[flow.taker]
-        converted = _ticks(flow.elements * ms_per_element)
-        capacity[giver, taker] += converted
-        capacity[taker, giver] += converted
+        ticks = _ticks(flow.elements * ms_per_element)
+        capacity[giver, taker] += ticks
+        capacity[taker, giver] += ticks
     graph = csr_array(np.minimum(capacity, MOST).astype(np.int32))
     residual = csr_array(np.maximum(graph.toarray() - maximum_flow(graph, source, sink).flow, 0))
     reached = breadth_first_order(residual, source, return_predecessors=False)
@@ -74,8 +74,12 @@ def total_ms(
 ) -> float:
     """What a choice costs, in milliseconds, without what all choices share."""
     layers = sum(c.integer_ms if c.layer in chosen else c.float_ms for c in costs)
-    converted = sum(f.elements for f in flows if (f.giver in chosen) != (f.taker in chosen))
-    return layers + ms_per_element * converted
+    return layers + ms_per_element * converted(flows, chosen)
+
+
+def converted(flows: Iterable[Flow], chosen: frozenset[str]) -> int:
+    """How many numbers flow between layers of different kinds."""
+    return sum(f.elements for f in flows if (f.giver in chosen) != (f.taker in chosen))
 
 
 def checkered(layers: Sequence[str], flows: Iterable[Flow]) -> frozenset[str]:

@@ -18,6 +18,9 @@ from ..model.predictor import Estimate, OnnxPredictor
 from ..model.qdq import Ranges, integers
 from .parity import decibels, powers
 
+AUDITED_PAIRS: Final = 2
+"""Of the calibration, on which each layer's effect alone is judged."""
+
 MOVED_PX: Final = 1.0
 """A disparity that moves so far, or farther, is all wrong to `harm`."""
 
