@@ -130,6 +130,12 @@ class Arch(BaseModel):
         return f"c={self.c}, {_count(self.stages, 'stage')}, {self.branches}"
 
 
+LARGEST = Arch(
+    c=SPACE_C[-1], d_max=SPACE_D_MAX[-1], conv3d=tuple(widths[-1] for widths in SPACE_CONV3D)
+)
+"""The network that holds all others of the space."""
+
+
 def arch_from(values: dict[str, Any]) -> Arch:
     """An `Arch` from loose values; a wrong one raises a one-line `UsageError`."""
     try:

@@ -37,6 +37,8 @@ class Header(BaseModel):
     arch: Arch
     origin: str
     """How the weights came to be, in a sentence; `untrained` for random ones."""
+    supernet: bool = False
+    """Whether the weights are those of every smaller network too."""
 
     @property
     def trained(self) -> bool:
@@ -48,9 +50,9 @@ def build(arch: Arch) -> Network:
     return FAMILIES[arch.family](arch).eval()
 
 
-def save(network: Network, path: Path, origin: str) -> None:
+def save(network: Network, path: Path, origin: str, supernet: bool = False) -> None:
     """Writes weights and arch as safetensors, whole or not at all."""
-    header = Header(arch=network.arch, origin=origin)
+    header = Header(arch=network.arch, origin=origin, supernet=supernet)
     weights = {name: value.contiguous() for name, value in network.state_dict().items()}
     with replacing(path) as temporary:
         save_file(weights, temporary, {HEADER: header.model_dump_json()})

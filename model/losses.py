@@ -126,6 +126,25 @@ def cross_entropy(scores: Tensor, labels: Tensor, class_weights: Tensor | None =
     )
 
 
+def imitation(stages: Sequence[Stage], largest: Sequence[Stage]) -> Sums:
+    """How far a network's maps are from a larger one's, term by term, as means over all pixels of a
+    stage: smooth L1 of disparities in pixels, Kullback-Leibler divergence of class scores.
+
+    The larger network's maps are taken as they are: no gradient reaches them. Stages have the terms
+    that both networks have.
+    """
+    terms: Sums = {}
+    for number, (own, its) in enumerate(zip(stages, largest, strict=False), 1):
+        terms[f"disparity_{number}"] = _mean_smooth_l1(own.disparity, its.disparity)
+        if own.scores is not None and its.scores is not None:
+            said, aim = (F.log_softmax(scores.float(), 1) for scores in (own.scores, its.scores))
+            apart = F.kl_div(said, aim.detach(), reduction="none", log_target=True)
+            terms[f"semantic_{number}"] = apart.sum(1).mean()
+        if own.refined is not None and its.refined is not None:
+            terms[f"refined_{number}"] = _mean_smooth_l1(own.refined, its.refined)
+    return terms
+
+
 def means(terms: Mapping[str, Tensor], counts: Counts, gamma: float = 0.0) -> Sums:
     """The terms as means over pixels; a term that no pixel speaks for is 0.
 
@@ -156,6 +175,10 @@ def class_weights(shares: NDArray[np.float64], k: float) -> NDArray[np.float64]:
     inverse = 1 / np.log(np.asarray(shares, np.float64) + k)
     weights: NDArray[np.float64] = len(inverse) * inverse / inverse.sum()
     return weights
+
+
+def _mean_smooth_l1(disparity: Tensor, aim: Tensor) -> Tensor:
+    return F.smooth_l1_loss(disparity.float(), aim.detach().float(), beta=1.0)
 
 
 def _scale(name: str, counts: Counts, gamma: float) -> float:

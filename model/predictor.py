@@ -127,10 +127,10 @@ class TorchPredictor:
         with torch.inference_mode():
             start = perf_counter()
             found = self.network(*pair, depth)
-            maps = [_enlarged(found[stage], pair[0].shape[-2:]) for stage in shown]
+            maps = [enlarged(found[stage], pair[0].shape[-2:]) for stage in shown]
             seconds = perf_counter() - start
         return [
-            _cut_back(disparity, semantic, left, seconds, stage + 1)
+            cut_back(disparity, semantic, left, seconds, stage + 1)
             for stage, (disparity, semantic) in zip(shown, maps, strict=True)
         ]
 
@@ -172,7 +172,7 @@ class OnnxPredictor:
         start = perf_counter()
         found = dict(zip(self.outputs, self._answer(pair), strict=True))
         seconds = perf_counter() - start
-        return _cut_back(found["disparity"][0], found.get("semantic"), left, seconds, stage)
+        return cut_back(found["disparity"][0], found.get("semantic"), left, seconds, stage)
 
     def predict_stages(
         self, left: Bytes, right: Bytes, stages: int | None = None
@@ -197,7 +197,7 @@ class OnnxPredictor:
         return tensor
 
 
-def _enlarged(stage: Stage, size: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:
+def enlarged(stage: Stage, size: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """A stage's best disparity, (H, W), and its class ids, (1, H, W), both at full size."""
     import torch.nn.functional as F
 
@@ -211,7 +211,7 @@ def _enlarged(stage: Stage, size: Any) -> tuple[NDArray[Any], NDArray[Any] | Non
     return full(stage.best)[0, 0].numpy(), semantic
 
 
-def _cut_back(
+def cut_back(
     disparity: NDArray[Any],
     semantic: NDArray[Any] | None,
     image: Bytes,

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Any, Final
 
-from ..arch import Arch, arch_from
+from ..arch import LARGEST, Arch, arch_from
 from ..box import SHIPPED, named_model
 from ..console import (
     add_output,
@@ -28,7 +28,7 @@ from ..data.catalog import DATASETS, require_generated
 from ..errors import Rts2Error, UsageError
 from ..files import existing_file, parse_json, read_json, sha256
 from ..machine import cores
-from .recipe import PRESETS, Recipe, recipe_from
+from .recipe import PRESETS, SANDWICH, Recipe, recipe_from
 
 if TYPE_CHECKING:
     import torch
@@ -184,7 +184,8 @@ def _recipe(options: argparse.Namespace) -> Recipe:
     values |= _of_dataset(values, given)
     own = {n: getattr(options, n) for n in COLOURS if getattr(options, n) is not None}
     values["augmentation"] = values.get("augmentation", {}) | own
-    values["arch"] = _arch(options, values.get("arch"))
+    whole = None if values.get("supernet") is None else LARGEST.model_dump()
+    values["arch"] = _arch(options, values.get("arch", whole))
     if options.init is not None:
         values["init"] = sha256(existing_file(options.init, "the checkpoint to start from"))
     if options.crop is not None:
@@ -261,6 +262,7 @@ FIELDS = (
     "coarse_gamma",
     "precision",
     "seed",
+    "supernet",
 )
 """The recipe's fields that an option of the same name sets."""
 
@@ -289,6 +291,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--arch", metavar="ARCH", help="c=8,stages=3,… or JSON (default: c=8)")
     command.add_argument("--branches", choices=sorted(BRANCHES), help="the variant")
+    command.add_argument(
+        "--supernet",
+        nargs="?",
+        type=_beside,
+        const=SANDWICH,
+        metavar="N",
+        help="train the arch (default: the largest of the space) and, among its weights, every "
+        f"smaller network: N random ones a step beside the smallest (default: {SANDWICH})",
+    )
     command.add_argument(
         "--init",
         metavar="MODEL",
@@ -353,6 +364,10 @@ def _add_setting(command: argparse.ArgumentParser) -> None:
 
 def _whole(text: str) -> int:
     return whole_between(text, 1, MOST)
+
+
+def _beside(text: str) -> int:
+    return whole_between(text, 0, 16)
 
 
 def _threads(text: str) -> int:

@@ -192,7 +192,13 @@ class GlobalNorm(nn.modules.batchnorm._BatchNorm):
     @staticmethod
     def around(norm: nn.BatchNorm2d | nn.BatchNorm3d) -> GlobalNorm:
         """The same norm, parameters and statistics shared."""
-        found = GlobalNorm(norm.num_features, norm.eps, norm.momentum, device="meta")
+        found = GlobalNorm(
+            norm.num_features,
+            norm.eps,
+            norm.momentum,
+            track_running_stats=norm.track_running_stats,
+            device="meta",
+        )
         for name, parameter in norm.named_parameters():
             setattr(found, name, parameter)
         for name, buffer in norm.named_buffers():
@@ -213,7 +219,8 @@ class GlobalNorm(nn.modules.batchnorm._BatchNorm):
         mean = _total(values.sum(axes)) / number
         centred = values - mean.view(shape)
         variance = _total(centred.square().sum(axes)) / number
-        self._remember(mean.detach(), variance.detach(), number)
+        if self.track_running_stats:
+            self._remember(mean.detach(), variance.detach(), number)
         scale = self.weight * (variance + self.eps).rsqrt()
         normed: Tensor = centred * scale.view(shape) + self.bias.view(shape)
         return normed.to(inputs.dtype)

@@ -63,6 +63,9 @@ class Recipe(BaseModel):
     rectification_px: Annotated[float, Field(ge=0, le=8)] = 0.0
     """The spread of a vertical offset of its right images: real pairs are never quite rectified."""
     arch: Arch = Arch()
+    supernet: Annotated[int, Field(ge=0, le=16)] | None = None
+    """How many random networks every step trains among the arch's weights, beside the arch and the
+    smallest one (the sandwich rule); None trains the arch alone."""
     init: str | None = None
     """The SHA-256 of the checkpoint whose weights it starts from; None starts from random ones."""
     epochs: Annotated[float, Field(gt=0)] | None = None
@@ -100,6 +103,8 @@ class Recipe(BaseModel):
             raise ValueError(
                 f"a batch of {self.batch} does not divide into {self.accumulate} micro-batches"
             )
+        if self.supernet is not None and self.arch.family != "rts2net":
+            raise ValueError("a supernet is of the rts2net family; leave --supernet out")
         multiple, (height, width) = self.arch.multiple, self.crop
         if any(side % multiple for side in self.crop):
             raise ValueError(
@@ -125,6 +130,14 @@ class Recipe(BaseModel):
         if self.schedule == "halved":
             return float(self.lr * 0.5 ** (self.epoch(step, samples) // self.halve_every))
         return self.lr
+
+    def beside(self, step: int) -> tuple[Arch, ...]:
+        """What `step` (from 0) trains among the weights of the arch."""
+        if self.supernet is None:
+            return ()
+        from ..supernet import beside  # which imports torch
+
+        return beside(self.arch, self.seed, step, self.supernet)
 
     def differences(self, other: Recipe) -> list[str]:
         """What differs, field by field: `lr is 0.001 there, 0.0005 here`."""
@@ -160,6 +173,9 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 STEREO: Final = {"semantic": False}
 """The arch of the paper's table I, for data without labels: disparity alone."""
 
+SANDWICH: Final = 2
+"""How many random networks a supernet's step trains unless told."""
+
 OURS: Final = {
     "lr": 1e-3,
     "schedule": "cosine",
@@ -176,6 +192,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
     "kitti-short": {"dataset": "kitti2015", "epochs": 300, "schedule": "halved"},
     "streets": {"dataset": "streets", "count": 4800, "epochs": 5, **OURS},
     "streets-long": {"dataset": "streets", "count": 20_000, "epochs": 20, **OURS},
+    "supernet": {"dataset": "streets", "count": 20_000, "epochs": 20, "supernet": SANDWICH, **OURS},
 }
 """The paper's runs (section IV-A, table I), and ours on scenes that need no download, of which
 `streets` made the weights in the box. What a row does not say is the field's default; k is the data

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from ..arch import UNTRAINED
+from ..arch import UNTRAINED, Arch
 from ..checkpoint import Network, build, not_finite, save
 from ..data.scene import Sample, fingerprint
 from ..errors import Rts2Error, UsageError
@@ -238,7 +238,7 @@ class Run:
             micros = self._fetched(batches)
             waited = perf_counter() - begin
             rate = recipe.rate(step, count)
-            outcome = self._step(micros, rate)
+            outcome = self._step(micros, rate, recipe.beside(step))
             took = perf_counter() - begin
             begin += took
             self.done, self.seconds = step + 1, self.seconds + took
@@ -247,10 +247,10 @@ class Run:
             row |= {"images_per_s": recipe.batch / took, "wait_share": waited / took}
             yield row | {"seconds": took}, outcome, micros[0]
 
-    def _step(self, micros: list[Batch], rate: float) -> Outcome:
+    def _step(self, micros: list[Batch], rate: float, beside: Sequence[Arch]) -> Outcome:
         """One step; whatever ends it becomes one line."""
         try:
-            return self.trainer.step(micros, rate)
+            return self.trainer.step(micros, rate, beside)
         except Lost:
             raise
         except Rts2Error as error:  # found in what all processes share
@@ -286,7 +286,7 @@ class Run:
 
     def _keep(self, log: Log) -> None:
         """Writes where the run stands: the state last, as it is what a run resumes from."""
-        out, network = self.setting.out, self.trainer.network
+        out, network, recipe = self.setting.out, self.trainer.network, self.recipe
         broken = not_finite(network)
         if broken:
             raise Rts2Error(
@@ -295,7 +295,7 @@ class Run:
         log.sync()
         rows = read_log(out / LOG)
         try:
-            save(network, out / CHECKPOINT, self._origin(rows))
+            save(network, out / CHECKPOINT, self._origin(rows), recipe.supernet is not None)
         except SafetensorError as error:
             raise Rts2Error(f"cannot write {out / CHECKPOINT}: {error}; {self._kept()}") from error
         self.kept = self.done

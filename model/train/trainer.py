@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..arch import MEAN, STD, STRIDES
+from ..arch import MEAN, STD, STRIDES, Arch
 from ..checkpoint import Network
 from ..errors import Rts2Error
-from ..losses import Counts, Sums, Truth, class_weights, count, means, sums, total
-from ..rts2net import Stage
+from ..losses import Counts, Sums, Truth, class_weights, count, imitation, means, sums, total
+from ..rts2net import RTS2Net, Stage
+from ..supernet import run
 from .distributed import World, share_norms
 from .loader import Batch
 from .precision import DTYPES, Resolved
@@ -65,10 +66,12 @@ class Trainer:
             weights = class_weights(shares, recipe.k)
             self.weights = torch.tensor(weights, dtype=torch.float32, device=device)
 
-    def step(self, micros: Sequence[Batch], rate: float) -> Outcome:
+    def step(self, micros: Sequence[Batch], rate: float, beside: Sequence[Arch] = ()) -> Outcome:
         """Moves the weights by the objective over all micro-batches of all processes.
 
-        Raises `Rts2Error`, and leaves the weights, where loss or gradients are not finite.
+        Networks `beside` the whole one add to the gradient of the weights that they share with it.
+        What is told is of the whole one alone. Raises `Rts2Error`, and leaves the weights, where
+        loss or gradients are not finite.
         """
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -77,7 +80,7 @@ class Trainer:
         summed: dict[str, Tensor] = {}
         shown: list[Stage] = []
         for batch in micros:
-            stages, terms = self._backward(batch, counts)
+            stages, terms = self._backward(batch, counts, beside)
             shown = shown or [_detached(stage) for stage in stages]
             summed = {name: summed.get(name, 0) + value for name, value in terms.items()}
         values = torch.stack(list(summed.values()))
@@ -101,7 +104,9 @@ class Trainer:
         own = sum(each[1:], each[0])
         return Counts.of(self.world.total(own.numbers()))
 
-    def _backward(self, batch: Batch, counts: Counts) -> tuple[list[Stage], Sums]:
+    def _backward(
+        self, batch: Batch, counts: Counts, beside: Sequence[Arch]
+    ) -> tuple[list[Stage], Sums]:
         """Adds a micro-batch's part of the gradient; returns its outputs and summed terms."""
         left, right = (self._normalised(image) for image in (batch.left, batch.right))
         labels = batch.truth.labels
@@ -109,13 +114,46 @@ class Trainer:
             batch.truth.disparity.to(self.device, non_blocking=True),
             None if labels is None else labels.to(self.device, non_blocking=True),
         )
-        mixed = self.dtype != torch.float32
-        with torch.autocast(self.device.type, self.dtype if mixed else None, enabled=mixed):
+        with self._mixed():
             stages: list[Stage] = self.network(left, right)
         terms = sums(stages, truth, self.weights)
-        loss = total(means(terms, counts, self.recipe.coarse_gamma))
-        self.scaler.scale(loss).backward()  # type: ignore[no-untyped-call]  # torch's own
+        self._add(self._objective(terms, counts))
+        for arch in beside:
+            self._imitate(arch, (left, right), truth, stages, counts)
         return stages, {name: value.detach() for name, value in terms.items()}
+
+    def _imitate(
+        self,
+        arch: Arch,
+        pair: tuple[Tensor, Tensor],
+        truth: Truth,
+        largest: Sequence[Stage],
+        counts: Counts,
+    ) -> None:
+        """Adds the gradient of a smaller network: half of it learns from the truth, half from what
+        the largest one says of every pixel.
+        """
+        assert isinstance(self.network, RTS2Net)  # the recipe's rule
+        with self._mixed():
+            stages = run(self.network, arch, *pair, self._shared)
+        learned = self._objective(sums(stages, truth, self.weights), counts)
+        imitated = total(imitation(stages, largest)) / (self.recipe.accumulate * self.world.size)
+        self._add((learned + imitated) / 2)  # all micro-batches have as many pixels
+
+    def _objective(self, terms: Sums, counts: Counts) -> Tensor:
+        return total(means(terms, counts, self.recipe.coarse_gamma))
+
+    def _add(self, loss: Tensor) -> None:
+        self.scaler.scale(loss).backward()  # type: ignore[no-untyped-call]  # torch's own
+
+    def _mixed(self) -> torch.autocast:
+        mixed = self.dtype != torch.float32
+        return torch.autocast(self.device.type, self.dtype if mixed else None, enabled=mixed)
+
+    def _shared(self, network: nn.Module) -> None:
+        """Makes the norms of a network see all processes, where there are several."""
+        if self.world.size > 1:
+            share_norms(network)
 
     def _normalised(self, images: Tensor) -> Tensor:
         """(B, H, W, 3) bytes → (B, 3, H, W) as networks expect it, channels last in memory."""

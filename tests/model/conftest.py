@@ -4,18 +4,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from torch import nn
 
 from rts2.model.checkpoint import Network
+from rts2.model.supernet import recalibrate
 
 
 def _lively(network: Network) -> Network:
-    norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d | nn.BatchNorm3d)]
-    for norm in norms:
-        norm.momentum = None  # a plain mean over all images so far
-    with torch.no_grad():
-        network.train()(*torch.randn(2, 4, 3, 64, 96))
-    return network.eval()
+    left, right = torch.randn(2, 4, 3, 64, 96)
+    recalibrate(network, [(left, right)])
+    return network
 
 
 @pytest.fixture

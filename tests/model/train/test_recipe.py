@@ -117,3 +117,13 @@ def test_differences_name_the_field_and_both_values() -> None:
         "lr is 0.001 there, 0.0005 here",
     ]
     assert mine.differences(recipe()) == []
+
+
+def test_a_supernet_s_steps_train_the_smallest_and_random_networks() -> None:
+    given = recipe_from({"dataset": "folder", "steps": 9, "arch": {"c": 4}, "supernet": 2})
+    assert len(given.beside(0)) == 3
+    assert given.beside(0) == given.beside(0) != given.beside(1)
+    assert given.beside(0)[0].c == 1
+    assert not recipe_from({"dataset": "folder", "steps": 9}).beside(0)
+    with pytest.raises(UsageError, match="a supernet is of the rts2net family"):
+        recipe_from({"dataset": "folder", "steps": 9, "arch": {"family": "anynet"}, "supernet": 2})

@@ -502,10 +502,10 @@ def test_the_checkpoint_named_is_the_one_on_the_disk(
     def failing_in(step: int, every: str) -> str:
         taken = run.Trainer.step
 
-        def fails(self: Any, micros: Any, rate: float) -> Any:
+        def fails(self: Any, micros: Any, rate: float, beside: Any) -> Any:
             if self.updates == step - 1:
                 raise Rts2Error("it broke")
-            return taken(self, micros, rate)
+            return taken(self, micros, rate, beside)
 
         with monkeypatch.context() as patch:
             patch.setattr(run.Trainer, "step", fails)
@@ -674,3 +674,19 @@ def test_a_preset_is_a_start_that_options_change(tmp_path: Path) -> None:
     assert (recipe["schedule"], recipe["k"], recipe["epochs"]) == ("halved", 2.0, None)
     assert (recipe["steps"], recipe["batch"], recipe["crop"]) == (1, 2, [32, 64])
     assert recipe["arch"]["conv3d"] == [2, 1, 1]
+
+
+def test_a_supernet_is_trained_and_gives_the_weights_of_smaller_networks(
+    pairs: Path, tmp_path: Path
+) -> None:
+    whole = ["--arch", "c=3,d_max=8,conv3d=4/2/2"]
+    train(options(pairs, tmp_path / "whole", 2, *whole, "--supernet", "1"))
+    network, header = load(tmp_path / "whole" / "checkpoint.safetensors")
+    assert header.supernet
+    assert network.arch == Arch(c=3, d_max=8, conv3d=(4, 2, 2))
+    start = str(tmp_path / "whole" / "checkpoint.safetensors")
+    small = ["--arch", "c=2,d_max=6,conv3d=3/2/1", "--init", start]
+    train(options(pairs, tmp_path / "small", 1, *small, "--lr", "1e-12"))
+    part = load(tmp_path / "small" / "checkpoint.safetensors")[0]
+    stem, whole_stem = (net.encoder.stem[0][0].weight for net in (part, network))
+    torch.testing.assert_close(stem, whole_stem[:2])

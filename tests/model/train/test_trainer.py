@@ -9,7 +9,8 @@ import torch
 
 from rts2.model.checkpoint import build
 from rts2.model.errors import Rts2Error, UsageError
-from rts2.model.losses import Truth, count, means, sums, total
+from rts2.model.losses import Truth, count, imitation, means, sums, total
+from rts2.model.supernet import run
 from rts2.model.train.loader import Batch
 from rts2.model.train.precision import resolve
 from rts2.model.train.recipe import Recipe, recipe_from
@@ -157,3 +158,31 @@ def test_terms_are_those_of_the_arch() -> None:
     assert term_names(anynet) == ["disparity_1", "disparity_2", "disparity_3"]
     learner = trainer(arch={"family": "anynet", "c": 1})
     assert list(learner.step([batch()], 1e-3).terms) == term_names(anynet)
+
+
+def test_networks_beside_the_whole_one_add_to_its_gradient_and_tell_nothing() -> None:
+    """Half of what a smaller one learns is the truth, half what the whole one says."""
+    whole = {"arch": {"c": 2}, "supernet": 1}
+    alone, among = trainer(**whole), trainer(**whole)
+    small = recipe(arch={"c": 1}).arch
+    first, second = alone.step([batch()], 1e-3), among.step([batch()], 1e-3, [small])
+    assert second.terms == first.terms
+    twin = trainer(**whole).network
+    left, right = (alone._normalised(image) for image in (batch().left, batch().right))
+    said, own = twin(left, right), run(twin, small, left, right)
+    counted = count(batch().truth, (16, 8, 4))
+    truth = total(means(sums(own, batch().truth), counted))
+    ((truth + total(imitation(own, said))) / 2).backward()
+    added = torch.cat([p.grad.flatten() for p in twin.parameters() if p.grad is not None])
+    torch.testing.assert_close(gradient(among), gradient(alone) + added, rtol=1e-3, atol=1e-5)
+
+
+def test_a_network_that_says_the_same_imitates_at_no_cost() -> None:
+    learner = trainer()
+    left, right = (learner._normalised(image) for image in (batch().left, batch().right))
+    stages = learner.network(left, right)
+    other = [stage._replace(disparity=stage.disparity + 3) for stage in stages]
+    terms = imitation(stages, stages)
+    assert set(terms) == set(term_names(learner.recipe))
+    assert all(value.item() == pytest.approx(0, abs=1e-6) for value in terms.values())
+    assert imitation(stages, other)["disparity_2"].item() == pytest.approx(2.5, rel=1e-5)
