@@ -23,7 +23,7 @@ from ..model.ops import ops
 from .calibrate import FORMS, fit
 from .heldout import hold_outs
 from .here import this_machine
-from .partfit import Harvest, damping, fit_parts, left_out
+from .partfit import Harvest, Known, damping, fit_parts, left_out, missed
 from .parts import PartModel, parts, per_part
 from .plan import Candidate, Job, random_candidate
 from .profile import (
@@ -236,7 +236,8 @@ def profile_of(
     journal: Journal, template: Profile, name: str, reference_ms: float | None = None
 ) -> Profile:
     """The profile of this machine in one runtime: the facts of `template`'s data sheets, the
-    journal's timings, tables of parts.
+    journal's timings, tables of parts. Where `template` has tables of the same runtime, of whatever
+    machine, costs may grow like those: how a runtime fills its kernels is much the same everywhere.
 
     A timing is its ratio to the reference times `reference_ms`, or else what the reference usually
     took. Timings that are not reliable weigh less in the tables, and are neither points of the
@@ -249,7 +250,8 @@ def profile_of(
         raise _too_few(0, NEEDED)
     usual = median(sample.reference_ms for sample in known)
     speed = Speed(usual, reference_ms or usual)
-    template, machine, runtime = blank(template), journal.machine, journal.runtime
+    before, template = template, blank(template)
+    machine, runtime = journal.machine, journal.runtime
     version = machine.versions.get(runtime, "not told")
     source = f"{titled(runtime)} on {machine.processor}, {machine.date}"
     facts = (
@@ -259,8 +261,9 @@ def profile_of(
     fitted: list[_Fitted] = []
     for precision in dict.fromkeys(sample.precision for sample in journal.samples):
         samples = [sample for sample in journal.samples if sample.precision == precision]
-        like = fitted[0].model if fitted else None
-        fitted.append(_Fitted(samples, runtime, speed, source, like))
+        first = fitted[0].model if fitted else None
+        beside = Known(first, _tables(before, runtime, precision))
+        fitted.append(_Fitted(samples, runtime, speed, source, beside))
     calibrations = tuple(known.calibration() for known in fitted)
     return template.model_copy(
         update={
@@ -285,9 +288,10 @@ class Speed(NamedTuple):
 
 
 class _Fitted:
-    """What was timed in one precision: points, and tables of them, which may grow `like` others.
+    """What was timed in one precision: points, and tables of them.
 
-    Raises `Rts2Error` where too few timings are reliable.
+    Tables of before are taken for a base where that predicts what was timed better. Raises
+    `Rts2Error` where too few timings are reliable.
     """
 
     def __init__(
@@ -296,20 +300,23 @@ class _Fitted:
         runtime: Runtime,
         speed: Speed,
         source: str,
-        like: PartModel | None,
+        known: Known,
     ) -> None:
         self._worthless = sum(sample.error > WORTHLESS for sample in samples)
         samples = [sample for sample in samples if sample.error <= WORTHLESS]
         self._reliable = [index for index, sample in enumerate(samples) if sample.reliable]
-        needed = NEEDED_LIKE if like else NEEDED
+        needed = NEEDED_LIKE if known.like else NEEDED
         if len(self._reliable) < needed:
             raise _too_few(len(self._reliable), needed)
         self._source = source
         seen = [_harvest(sample, speed) for sample in samples]
-        power = damping(seen, like)
-        self._like = like
+        self._known = min(
+            (known, known._replace(before=None)) if known.before else (known,),
+            key=lambda each: missed(seen, self._reliable, each),
+        )
+        power = damping(seen, self._known)
         self._harvests = [_undrifted(harvest, power) for harvest in seen]
-        self.model = fit_parts(self._harvests, like)
+        self.model = fit_parts(self._harvests, self._known)
         self.points = tuple(
             _point(samples[index], self._harvests[index], runtime, source)
             for index in self._reliable
@@ -321,7 +328,8 @@ class _Fitted:
         told = f", {busy} more of a busy machine weigh less" if busy else ""
         told += f", {self._worthless} more were worth nothing" if self._worthless else ""
         first = self.points[0]
-        errors = left_out(self._harvests, self._reliable, _asked(), self._like)
+        told += ", in proportion to earlier tables" if self._known.before else ""
+        errors = left_out(self._harvests, self._reliable, _asked(), self._known)
         return Calibration(
             runtime=first.runtime,
             precision=first.precision,
@@ -330,6 +338,15 @@ class _Fitted:
             source=f"times by node of {len(self.points)} whole networks{told}; {self._source}",
             held_out=hold_outs(self.points, lambda others: fit(others, FORMS["parts"])),
         )
+
+
+def _tables(profile: Profile, runtime: Runtime, precision: Precision) -> PartModel | None:
+    """What a profile already tells of the parts of networks in a runtime and precision."""
+    for known in profile.calibrations:
+        same = (known.runtime, known.precision) == (runtime, precision)
+        if same and isinstance(known.model, PartModel):
+            return known.model
+    return None
 
 
 def _asked() -> list[Candidate]:

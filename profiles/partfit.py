@@ -34,6 +34,13 @@ BLOCKS: Final = (2, 4, 8, 16)
 """In what numbers kernels take channels: a part has 1, 2, 4 or 8 times c of them, so that all of
 its channels fill blocks of 16 where c fills blocks of 16, 8, 4 or 2."""
 
+BEFORE_SHARED: Final = 0.05
+BEFORE_OWN: Final = 0.03
+"""The same off tables of before, which know how the runtime fills its kernels."""
+
+FOLDS: Final = 8
+"""Into how many parts timings are cut to see what predicts them better."""
+
 RIDGE: Final = 0.02
 """How much the base prefers small coefficients to a better fit of one timing, relatively."""
 
@@ -60,6 +67,18 @@ ROUNDS: Final = 2
 """How often the base and what differs from it are found in turn."""
 
 
+class Known(NamedTuple):
+    """What is known of a runtime's costs beside the timings."""
+
+    like: PartModel | None = None
+    """The tables of another precision: the base may grow like them, too."""
+    before: PartModel | None = None
+    """Tables of this precision, of before or of another machine: the base is in proportion."""
+
+
+NOTHING: Final = Known()
+
+
 class Harvest(NamedTuple):
     """One timed network: what each of its parts took, in milliseconds."""
 
@@ -75,22 +94,37 @@ class Harvest(NamedTuple):
     """Of the stages' 3D convs; all are 3d without them."""
 
 
-def fit_parts(harvests: Sequence[Harvest], like: PartModel | None = None) -> PartModel:
+def fit_parts(harvests: Sequence[Harvest], known: Known = NOTHING) -> PartModel:
     """The tables of every part from networks that were timed part by part.
-
-    Where those of another precision of the runtime are known, the base may also grow `like` them.
 
     Raises:
         Rts2Error: a part was not timed at one of the sizes.
     """
-    return _Fit(_Rows.of(harvests), like).model()
+    return _Fit(_Rows.of(harvests), known).model()
+
+
+def missed(harvests: Sequence[Harvest], chosen: Sequence[int], known: Known) -> float:
+    """The mean of |ln(true / predicted)| over the chosen networks, each predicted from tables
+    without it and some others.
+    """
+    rows = _Rows.of(harvests)
+    found = []
+    for fold in range(FOLDS):
+        out = list(chosen)[fold::FOLDS]
+        if not out:
+            continue
+        others = _Fit(rows.where(~np.isin(rows.network, out)), known)
+        for index in out:
+            own = rows.where(rows.network == index)
+            found.append(abs(np.log(own.ms.sum() / others.costs(own).sum())))
+    return float(np.mean(found))
 
 
 def left_out(
     harvests: Sequence[Harvest],
     chosen: Sequence[int] | None = None,
     asked: Sequence[Candidate] = (),
-    like: PartModel | None = None,
+    known: Known = NOTHING,
 ) -> Floats:
     """ln(true / predicted) of each network, or of the chosen ones, predicted from tables without
     it; scaled, where networks are given that will be `asked` about, to what those expect.
@@ -100,31 +134,31 @@ def left_out(
     standard error that its own prediction had, times the median one of the asked networks.
     """
     rows = _Rows.of(harvests)
-    usual = _usual_uncertainty(rows, asked, like) if asked else None
+    usual = _usual_uncertainty(rows, asked, known) if asked else None
     found = []
     for index in range(len(harvests)) if chosen is None else chosen:
         own = rows.where(rows.network == index)
-        others = _Fit(rows.where(rows.network != index), like)
+        others = _Fit(rows.where(rows.network != index), known)
         scale = usual / others.uncertainty(own) if usual else 1.0
         found.append(scale * np.log(own.ms.sum() / others.costs(own).sum()))
     return np.array(found)
 
 
-def _usual_uncertainty(rows: _Rows, asked: Sequence[Candidate], like: PartModel | None) -> float:
-    whole = _Fit(rows, like)
-    known = [Harvest(*candidate, defaultdict(float)) for candidate in asked]
-    every = _Rows.of(known, rows.groups)
-    told = (whole.uncertainty(every.where(every.network == index)) for index in range(len(known)))
+def _usual_uncertainty(rows: _Rows, asked: Sequence[Candidate], known: Known) -> float:
+    whole = _Fit(rows, known)
+    each = [Harvest(*candidate, defaultdict(float)) for candidate in asked]
+    every = _Rows.of(each, rows.groups)
+    told = (whole.uncertainty(every.where(every.network == index)) for index in range(len(each)))
     return float(np.median(list(told)))
 
 
-def damping(harvests: Sequence[Harvest], like: PartModel | None = None) -> float:
+def damping(harvests: Sequence[Harvest], known: Known = NOTHING) -> float:
     """By what power of the reference's drift a network's drift differs from the reference's.
 
     Others who use the machine delay a reference of small kernels more than most networks, whose
     ratio to it then comes out too small: below 0.
     """
-    return float(_Fit(_Rows.of(harvests), like).damping)
+    return float(_Fit(_Rows.of(harvests), known).damping)
 
 
 @dataclass(frozen=True)
@@ -186,9 +220,9 @@ def _parts(harvest: Harvest) -> tuple[Part, ...]:
 class _Fit:
     """Bases, and what differs from them, found in turn."""
 
-    def __init__(self, rows: _Rows, like: PartModel | None) -> None:
+    def __init__(self, rows: _Rows, known: Known) -> None:
         self._groups = rows.groups
-        self._like = like
+        self._known = known
         shared = {
             (name, value): index
             for index, (name, value) in enumerate(
@@ -252,12 +286,8 @@ class _Fit:
 
     def _told(self, found: Sequence[Part] | NDArray[np.object_]) -> _Told:
         """What bases of these parts, all of one name, are computed from."""
-        like = self._like
-        known = like is not None and found[0].name in like.tables
-        return _Told(
-            np.array([part.at for part in found], float),
-            np.array([like.cost_ms(part) if like and known else 0.0 for part in found]),
-        )
+        like, before = (_costs(model, found) for model in self._known)
+        return _Told(np.array([part.at for part in found], float), like, before)
 
     def _base_cost(self, group: int, told: _Told) -> Floats:
         """The base of a part at one size; where it was timed at others alone, in proportion."""
@@ -322,9 +352,18 @@ class _Fit:
 
     def _expected(self) -> Floats:
         """One over the variance that each unknown is expected to have around 0."""
-        shared = np.full(len(self._shared), SHARED)
-        own = np.full(len(self._values) - len(shared), OWN)
+        before = self._known.before
+        known = np.array([before is not None and name in before.tables for name, _ in self._shared])
+        shared = np.where(known, BEFORE_SHARED, SHARED)
+        own = np.tile(np.where(known, BEFORE_OWN, OWN), len(self._sizes))
         return 1 / np.concatenate([shared, own, [DAMPED]]) ** 2
+
+
+def _costs(model: PartModel | None, found: Sequence[Part] | NDArray[np.object_]) -> Floats:
+    """What tables say of parts of one name, 0 where they do not know it."""
+    if model is None or found[0].name not in model.tables:
+        return np.zeros(len(found))
+    return np.array([model.cost_ms(part) for part in found])
 
 
 class _Told(NamedTuple):
@@ -334,6 +373,8 @@ class _Told(NamedTuple):
     """(n, axes)"""
     like: Floats
     """(n,): what the same part takes in another precision; 0 where that is unknown."""
+    before: Floats
+    """(n,): what it took in tables of before; 0 where that is unknown."""
 
 
 class _Base:
@@ -358,8 +399,10 @@ class _Base:
     def _columns(told: _Told) -> Floats:
         """1, x, x² of the first axis, the same with x filled up to blocks, and where it fills none;
         each times 1, y and y² of the second axis where there is one (banded planes meet planes);
-        and what another precision takes.
+        and what another precision takes. Where tables of before know it, what those have alone.
         """
+        if told.before.any():
+            return told.before[:, None]
         places = told.places
         x = places[:, 0]
         columns = [np.ones_like(x), x, x**2]

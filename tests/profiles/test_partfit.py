@@ -9,7 +9,7 @@ import pytest
 
 from rts2.model.ops import ops
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.partfit import Harvest, damping, fit_parts, left_out
+from rts2.profiles.partfit import Harvest, Known, damping, fit_parts, left_out, missed
 from rts2.profiles.parts import Part, parts
 from rts2.profiles.plan import Candidate, jobs, random_candidate
 
@@ -146,7 +146,7 @@ def test_another_precision_needs_fewer_timings_where_it_goes_like_the_first() ->
     chance = random.Random(1)
     drawn = [random_candidate(chance) for _ in range(60)]
     missed = []
-    for model in (fit_parts(second), fit_parts(second, like)):
+    for model in (fit_parts(second), fit_parts(second, Known(like))):
         told = []
         for each in drawn:
             known = parts(ops(*each))
@@ -154,3 +154,37 @@ def test_another_precision_needs_fewer_timings_where_it_goes_like_the_first() ->
             told.append(abs(model.total_ms(known) / true - 1))
         missed.append(np.mean(told))
     assert missed[1] < 0.01 < missed[0]
+
+
+def test_tables_of_before_let_few_timings_say_how_fast_the_machine_is() -> None:
+    """Twenty networks of a machine 1.3 times as slow, whose kernels fill blocks alike."""
+    slower = [
+        harvest._replace(ms={part: 1.3 * ms for part, ms in harvest.ms.items()})
+        for harvest in harvests(0.06, 0.01)[:24]
+    ]
+    before = fit_parts(harvests())
+    chance = random.Random(5)
+    drawn = [random_candidate(chance) for _ in range(60)]
+    wrong = []
+    for known in (Known(), Known(before=before)):
+        model = fit_parts(slower, known)
+        told = [predict_ms(model, *each) / (1.3 * truth(each)) - 1 for each in drawn]
+        wrong.append(np.mean(np.abs(told)))
+    assert wrong[1] < 0.02 < wrong[0]
+    chosen = range(0, 24, 2)
+    assert missed(slower, chosen, Known(before=before)) < missed(slower, chosen, Known())
+
+
+def test_tables_of_before_that_are_wrong_predict_worse() -> None:
+    """Every value of c turned round: what is timed tells that they are no use."""
+    known = harvests()
+    turned = fit_parts(
+        [
+            harvest._replace(
+                ms={part: ms * (1 + 0.5 * (harvest.arch.c % 3)) for part, ms in harvest.ms.items()}
+            )
+            for harvest in known
+        ]
+    )
+    chosen = range(0, 64, 4)
+    assert missed(known, chosen, Known(before=turned)) > missed(known, chosen, Known())

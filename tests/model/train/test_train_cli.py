@@ -686,7 +686,7 @@ def test_a_supernet_is_trained_and_gives_the_weights_of_smaller_networks(
     assert network.arch == Arch(c=3, d_max=8, conv3d=(4, 2, 2))
     start = str(tmp_path / "whole" / "checkpoint.safetensors")
     small = ["--arch", "c=2,d_max=6,conv3d=3/2/1", "--init", start]
-    train(options(pairs, tmp_path / "small", 1, *small, "--lr", "1e-12"))
+    train(options(pairs, tmp_path / "small", 1, *small, "--lr", "1e-6"))
     part = load(tmp_path / "small" / "checkpoint.safetensors")[0]
     stem, whole_stem = (net.encoder.stem[0][0].weight for net in (part, network))
-    torch.testing.assert_close(stem, whole_stem[:2])
+    torch.testing.assert_close(stem, whole_stem[:2], rtol=0, atol=1e-5)
