@@ -66,6 +66,14 @@ def remove(path: Path) -> None:
         raise _unwritable(path, error) from error
 
 
+def remove_empty(folder: Path, within: Path) -> None:
+    """Removes `folder` and those above it, below `within`, as far as nothing is left in them."""
+    for each in (folder, *folder.parents):
+        if each == within or not each.is_dir() or any(each.iterdir()):
+            return
+        each.rmdir()
+
+
 def output_folder(path: Path) -> Path:
     """`path`, created where missing and known to be writable."""
     try:
@@ -87,9 +95,9 @@ def output_file(path: Path) -> Path:
 def filling_folder(path: Path, last: str) -> Iterator[Path]:
     """Yields an empty folder; what the block leaves there moves into `path` if it succeeds.
 
-    Other files stay, as they may be the user's; files of the same names are replaced where a file
-    named `last` tells an earlier result. It comes last: while it is the old one, the folder is
-    not yet the new one.
+    Folders within it move file by file. Other files stay, as they may be the user's; files of the
+    same names are replaced where a file named `last` tells an earlier result. It comes last: while
+    it is the old one, the folder is not yet the new one.
     """
     output_folder(path)
     try:
@@ -98,13 +106,18 @@ def filling_folder(path: Path, last: str) -> Iterator[Path]:
         raise _unwritable(path, error) from error
     try:
         yield temporary
-        filled = sorted(temporary.iterdir(), key=lambda file: (file.name == last, file.name))
-        for file in filled:
-            _refuse_special(path / file.name)
-            if (path / file.name).exists() and not (path / last).exists():
-                raise Rts2Error(f"{path / file.name} stands there already; choose another --out")
-        for file in filled:
-            file.replace(path / file.name)
+        files = (each for each in temporary.rglob("*") if each.is_file())
+        names = sorted(
+            (file.relative_to(temporary) for file in files),
+            key=lambda name: (str(name) == last, name),
+        )
+        for name in names:
+            _refuse_special(path / name)
+            if (path / name).exists() and not (path / last).exists():
+                raise Rts2Error(f"{path / name} stands there already; choose another --out")
+        for name in names:
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).replace(path / name)
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:

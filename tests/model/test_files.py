@@ -19,6 +19,7 @@ from rts2.model.files import (
     output_folder,
     read_json,
     remove,
+    remove_empty,
     replacing,
     sha256,
     write_bytes,
@@ -242,6 +243,34 @@ def test_what_is_somebody_elses_stays(tmp_path: Path) -> None:
         (folder / MARKER).write_text("new")
     assert entries(path) == ["chapters", MARKER, "thesis.tex"]
     assert (path / "thesis.tex").read_text() == "mine"
+
+
+def test_folders_within_are_filled_file_by_file(tmp_path: Path) -> None:
+    path = tmp_path / "bundle"
+    (path / "triton").mkdir(parents=True)
+    (path / "triton" / "mine").write_text("mine")
+    for text in ("old", "new"):
+        with filling_folder(path, MARKER) as folder:
+            (folder / "triton" / "1").mkdir(parents=True)
+            (folder / "triton" / "1" / "model.onnx").write_text(text)
+            (folder / MARKER).write_text(text)
+    assert entries(path) == [MARKER, "triton"]
+    assert entries(path / "triton") == ["1", "mine"]
+    assert (path / "triton" / "1" / "model.onnx").read_text() == "new"
+    assert (path / "triton" / "mine").read_text() == "mine"
+
+
+def test_folders_that_are_empty_go_and_others_stay(tmp_path: Path) -> None:
+    deep = tmp_path / "a" / "b" / "c"
+    deep.mkdir(parents=True)
+    (tmp_path / "a" / "mine").touch()
+    remove_empty(deep, tmp_path)
+    assert entries(tmp_path) == ["a"]
+    assert entries(tmp_path / "a") == ["mine"]
+    remove_empty(deep, tmp_path)
+    (tmp_path / "a" / "mine").unlink()
+    remove_empty(tmp_path / "a", tmp_path)
+    assert entries(tmp_path) == []
 
 
 def filled(path: Path) -> None:
