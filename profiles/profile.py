@@ -22,6 +22,7 @@ from ..model.files import parse_json, read_json
 from ..model.ops import Kind
 from .latency import FEATURES, LatencyModel
 from .parts import PartModel
+from .trtexec import Generation
 
 Runtime = Literal["pytorch", "onnxruntime", "openvino", "tensorrt"]
 Side = Annotated[int, Field(ge=32, le=16384)]
@@ -64,6 +65,9 @@ class RuntimeSupport(Frozen):
     """The highest ONNX opset that it reads."""
     operators: str | None = None
     """The name of the table of operators that it reads, among `opsets/`."""
+    generations: tuple[Generation, ...] = ()
+    """Of TensorRT: those that the device may have, the usual one first; without any, `version`
+    tells the only one."""
     source: str
 
 
