@@ -7,6 +7,7 @@ same rule as those of fp16 graphs (`kept_float`).
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,12 +17,18 @@ from ..model.files import write_bytes
 from .fp16 import kept_float
 from .source import opened
 
+COUNTED = re.compile(r"[A-Za-z]+_\d+")
+"""The name that OpenVINO gives to what has none; the number counts what the process made before."""
+
 PRECISE = {"name": "precise", "version": "0"}
 """The attribute of OpenVINO that keeps an operator from being lowered."""
 
 
 def to_ir(graph: Path, path: Path) -> None:
-    """Writes the float graph as OpenVINO IR: `path` (.xml), and its weights beside it (.bin)."""
+    """Writes the float graph as OpenVINO IR: `path` (.xml), and its weights beside it (.bin).
+
+    Equal graphs give equal bytes.
+    """
     import openvino
 
     kept = tuple(layer for layer, _ in kept_float(opened(graph)[0]))
@@ -30,6 +37,8 @@ def to_ir(graph: Path, path: Path) -> None:
         openvino.save_model(openvino.Core().read_model(str(graph)), plain, compress_to_fp16=False)
         tree = ElementTree.parse(plain)
         for layer in tree.iterfind("layers/layer"):
+            if COUNTED.fullmatch(layer.get("name", "")):
+                layer.set("name", f"{layer.get('type')}_{layer.get('id')}")
             # An operator of the file may become several, named after it.
             if layer.get("name", "").startswith(kept):
                 _mark(layer)
