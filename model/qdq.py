@@ -78,20 +78,28 @@ def flows(model: onnx.ModelProto) -> tuple[Flow, ...]:
 
 
 def usual(model: onnx.ModelProto) -> tuple[str, ...]:
-    """The layers that are usually worth computing in integers, where nobody has timed this graph.
-
-    All but those of `SELDOM`, and 3D convolutions, for which runtimes have no fast kernel of
-    integers: as 2D ones with banded weights they have.
+    """The layers that are usually worth computing in integers, where nobody has timed this graph:
+    all but the `seldom` ones.
     """
+    left = seldom(model)
+    return tuple(layer.name for layer in layers(model) if layer.name not in left)
+
+
+def seldom(model: onnx.ModelProto) -> dict[str, str]:
+    """The layers that are seldom worth computing in integers, each with the reason."""
     view = _View(model)
-    names = (layer.name for layer in view.layers())
-    return tuple(name for name in names if not SELDOM.match(name) and view.is_2d(name))
+    return {
+        layer.name: CONVERTED if SELDOM.match(layer.name) else NO_3D_KERNEL
+        for layer in view.layers()
+        if SELDOM.match(layer.name) or not view.is_2d(layer.name)
+    }
 
 
 SELDOM: Final = re.compile(r"encoder\.stem\.|features\.stem\.|regularize\.\d\.layers\.0/")
-"""Layers of large maps and few channels, and those that take one channel: converting what they give
-costs more than integers save.
-"""
+"""Layers of large maps and few channels, and those that take one channel."""
+
+CONVERTED: Final = "large maps of few channels: converting them costs more than integers save"
+NO_3D_KERNEL: Final = "a 3D convolution: runtimes have no fast kernel of integers for it"
 
 
 def nominal(model: onnx.ModelProto) -> Ranges:

@@ -73,7 +73,7 @@ def quantize(
     known = calibrate(model, header, pairs, cache)
     ranges = known.ranges(method)
     names = [layer.name for layer in layers(model)]
-    kept = {name: why for name in names if (why := _rule(name)) is not None}
+    kept = {name: why for name in names if (why := rule(name)) is not None}
     free = frozenset(name for name in names if name not in kept)
     reference = Reference(model, header, known.first(pairs, AUDITED_PAIRS))
     effects = alone(model, sorted(free), ranges, reference)
@@ -101,5 +101,6 @@ def quantize(
     )
 
 
-def _rule(layer: str) -> str | None:
+def rule(layer: str) -> str | None:
+    """Why a layer stays float whatever is measured; None where it need not."""
     return next((why for known, why in KEPT if known.match(layer)), None)

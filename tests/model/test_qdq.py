@@ -21,6 +21,7 @@ from rts2.model.qdq import (
     layers,
     nominal,
     quantized_values,
+    seldom,
     usual,
 )
 
@@ -131,6 +132,11 @@ def test_the_usual_layers_leave_out_the_first_ones_and_3d(exported: onnx.ModelPr
         "regularize.2.layers.0/Conv",
         *(f"regularize.1.layers.{index}/Conv" for index in (0, 3, 6)),
     }
+    reasons = seldom(exported)
+    assert reasons.keys() == others
+    assert "few channels" in reasons["encoder.stem.1.0/Conv"]
+    assert "few channels" in reasons["regularize.1.layers.0/Conv"]
+    assert "3D" in reasons["regularize.1.layers.3/Conv"]
 
 
 def test_a_layer_that_is_not_there_and_a_value_without_a_range(exported: onnx.ModelProto) -> None:
