@@ -146,6 +146,7 @@ def integers(
     made = _quantizer(
         copy, members, _tensor_ranges({**ranges, **_below_zero(ranges, held)}), symmetric
     )
+    _sort(made.graph)
     _name_pairs(made.graph)
     return made
 
@@ -274,6 +275,27 @@ def _silent() -> Iterator[None]:
         yield
     finally:
         logging.disable(before)
+
+
+def _sort(graph: onnx.GraphProto) -> None:
+    """Puts every node behind those whose results it takes, else in the order in which it was.
+
+    The quantizer appends its pairs at the end; ONNX wants them before, and not every runtime sorts.
+    """
+    nodes = list(graph.node)
+    maker = {value: index for index, node in enumerate(nodes) for value in node.output}
+    order: dict[int, None] = {}
+    stack = list(reversed(range(len(nodes))))
+    while stack:
+        index = stack.pop()
+        makers = (maker[value] for value in nodes[index].input if value in maker)
+        before = [each for each in makers if each not in order]
+        if before:
+            stack += [index, *reversed(before)]
+        else:
+            order[index] = None
+    del graph.node[:]
+    graph.node.extend(nodes[index] for index in order)
 
 
 def _name_pairs(graph: onnx.GraphProto) -> None:

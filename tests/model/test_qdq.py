@@ -113,6 +113,18 @@ def test_symmetric_pairs_have_zero_points_of_zero_and_stand_at_inputs_alone(
     assert np.isfinite(answers(made)).all()
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_what_is_made_is_valid_onnx_and_float_nodes_keep_their_order(
+    exported: onnx.ModelProto, symmetric: bool
+) -> None:
+    chosen = [name for name in usual(exported) if "MaxPool" not in name]
+    made = integers(exported, chosen, nominal(exported), symmetric)
+    onnx.checker.check_model(made, full_check=True)
+    order = [node.name for node in made.graph.node]
+    convolutions = [node.name for node in exported.graph.node if node.op_type == "Conv"]
+    assert [name for name in order if name in convolutions] == convolutions
+
+
 def test_every_node_bears_the_name_of_its_part(exported: onnx.ModelProto) -> None:
     made = integers(exported, usual(exported), nominal(exported))
     known = ("encoder", "disparity", "semantic", "classify", "volume", "regularize", "refine")
