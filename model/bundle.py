@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Final, Literal
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from .errors import Rts2Error, UsageError
 from .files import read_json, sha256
@@ -15,10 +15,23 @@ MODEL: Final = "model.onnx"
 """The graph's name in every bundle."""
 
 
-class _File(BaseModel):
+def _inside(name: str) -> str:
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or str(path) != name or name == ".":
+        raise ValueError("a file of a bundle must lie in its folder")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_inside)]
+"""A file's path within the bundle, with slashes: it leads nowhere else."""
+
+
+class BundleFile(BaseModel):
+    """A file of a bundle as its configuration tells it."""
+
     model_config = ConfigDict(frozen=True)
 
-    name: str
+    name: FileName
     sha256: str
 
 
@@ -28,7 +41,36 @@ class _Contents(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     schema_: Literal["rts2.deployment/1"] = Field(alias="schema")
-    files: tuple[_File, ...]
+    files: tuple[BundleFile, ...]
+
+
+def contents(folder: Path) -> tuple[BundleFile, ...]:
+    """The files of the bundle in `folder`, as its configuration tells them.
+
+    Raises:
+        UsageError: the folder is no bundle.
+        Rts2Error: its configuration is broken.
+    """
+    if not (folder / CONFIGURATION).is_file():
+        why = f"a folder without {CONFIGURATION}" if folder.is_dir() else "no folder"
+        raise UsageError(f"a bundle must be a folder that rts2-deploy wrote: {folder}: it is {why}")
+    return read_json(folder / CONFIGURATION, _Contents, "a deployment configuration").files
+
+
+def require_unchanged(folder: Path, file: BundleFile) -> Path:
+    """The path of a bundle's file.
+
+    Raises `Rts2Error` where it is missing, or not the one that the configuration was written with.
+    """
+    path = folder / file.name
+    if not path.is_file():
+        raise Rts2Error(f"{folder} holds no {file.name}; make the bundle again with rts2-deploy")
+    if sha256(path) != file.sha256:
+        raise Rts2Error(
+            f"{path} is not the file that {CONFIGURATION} tells the hash of; "
+            "make the bundle again with rts2-deploy"
+        )
+    return path
 
 
 def graph_of(path: Path) -> Path:
@@ -44,14 +86,7 @@ def graph_of(path: Path) -> Path:
         raise UsageError(
             f"a model must be a file or a bundle: {path}: it is a folder without {CONFIGURATION}"
         )
-    known = read_json(path / CONFIGURATION, _Contents, "a deployment configuration")
-    graph = path / MODEL
-    hashes = [file.sha256 for file in known.files if file.name == MODEL]
-    if not hashes or not graph.is_file():
-        raise Rts2Error(f"{path} holds no {MODEL}; make the bundle again with rts2-deploy")
-    if sha256(graph) != hashes[0]:
-        raise Rts2Error(
-            f"{graph} is not the file that {CONFIGURATION} tells the hash of; "
-            "make the bundle again with rts2-deploy"
-        )
-    return graph
+    for file in contents(path):
+        if file.name == MODEL:
+            return require_unchanged(path, file)
+    raise Rts2Error(f"{path} holds no {MODEL}; make the bundle again with rts2-deploy")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rts2.model.bundle import CONFIGURATION, MODEL, graph_of
+from rts2.model.bundle import CONFIGURATION, MODEL, contents, graph_of
 from rts2.model.errors import Rts2Error, UsageError
 
 
@@ -51,8 +51,16 @@ def test_a_broken_configuration_is_one_line(bundle: Path, text: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_every_bundle_has_these_names() -> None:
-    """The writer of bundles names its files by itself."""
-    from rts2.search.deploy import bundle
+@pytest.mark.parametrize("name", ["/etc/passwd", "../x", "a/../../x", "", ".", "a//b", "./a"])
+def test_a_file_outside_of_the_bundle_is_refused(bundle: Path, name: str) -> None:
+    known = {"schema": "rts2.deployment/1", "files": [{"name": name, "sha256": "0" * 64}]}
+    (bundle / CONFIGURATION).write_text(json.dumps(known))
+    with pytest.raises(Rts2Error, match=r"files\.0\.name: a file of a bundle must lie"):
+        contents(bundle)
 
-    assert bundle.MODEL == MODEL
+
+def test_what_is_no_bundle_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"it is a folder without"):
+        contents(tmp_path)
+    with pytest.raises(UsageError, match=r"it is no folder"):
+        contents(tmp_path / "none")
