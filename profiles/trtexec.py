@@ -21,6 +21,17 @@ from ..model.errors import UsageError
 PATH = "/usr/src/tensorrt/bin/trtexec"
 """Where JetPack and NVIDIA's packages put it."""
 
+LOCATE = f"""TRTEXEC=${{TRTEXEC:-{PATH}}}
+if ! command -v "$TRTEXEC" >/dev/null 2>&1; then
+    if command -v trtexec >/dev/null 2>&1; then
+        TRTEXEC=trtexec
+    else
+        echo "trtexec is not at $TRTEXEC; set TRTEXEC to where it is" >&2
+        exit 1
+    fi
+fi"""
+"""Has a shell script find it, or end with one line."""
+
 WORKSPACE_MB = 1024
 """What a layer may use beside its inputs and outputs: a TX2 has 8 GB for everything."""
 

@@ -14,7 +14,7 @@ from ...model.files import filling_folder, write_bytes, write_json
 from ..opset import refuse_operators
 from ..plan import Candidate
 from ..profile import Profile, RuntimeSupport
-from ..trtexec import PATH, PRECISIONS, build_flags
+from ..trtexec import LOCATE, PRECISIONS, build_flags
 from .manifest import MANIFEST, KitNetwork, Manifest
 from .plan import networks
 from .prior import prior
@@ -132,7 +132,7 @@ def _script(manifest: Manifest) -> str:
         "@NETWORKS@": " ".join(reference_first),
         "@PRECISIONS@": " ".join(manifest.precisions),
         "@FLAGS@": "\n".join(cases),
-        "@TRTEXEC@": PATH,
+        "@LOCATE@": LOCATE,
     }
     text = _text("run.sh")
     for mark, value in filled.items():

@@ -19,15 +19,7 @@ flags() {
     esac
 }
 
-TRTEXEC=${TRTEXEC:-@TRTEXEC@}
-if ! command -v "$TRTEXEC" >/dev/null 2>&1; then
-    if command -v trtexec >/dev/null 2>&1; then
-        TRTEXEC=trtexec
-    else
-        echo "trtexec is not at $TRTEXEC; set TRTEXEC to where it is" >&2
-        exit 1
-    fi
-fi
+@LOCATE@
 LOGS=logs-$KIT
 mkdir -p "$LOGS" || exit 1
 

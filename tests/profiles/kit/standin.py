@@ -1,5 +1,7 @@
 """In the place of `trtexec`: its options, its output, and times that are planted or ONNX Runtime's.
 
+Like the real one it ends with an error where it is given an option that its release does not know.
+
 KIT_TIMES     JSON file of median ms by ONNX file name; without it the graph is run, on one thread
 KIT_FAILS     ONNX files that no engine is made of, separated by commas
 KIT_RELEASE   as `trtexec` prints it (default: 8201)
@@ -15,6 +17,51 @@ from pathlib import Path
 from statistics import median
 
 RELEASE = os.environ.get("KIT_RELEASE", "8201")
+
+ALWAYS = (
+    "onnx saveEngine loadEngine timingCacheFile profilingVerbosity exportLayerInfo warmUp duration"
+)
+ALWAYS += " iterations loadInputs exportOutput exportTimes noDataTransfers"
+SOME = {
+    "workspace": ((8, 0), (9, 99)),
+    "memPoolSize": ((8, 4), (99, 0)),
+    "builderOptimizationLevel": ((8, 6), (99, 0)),
+    "fp16": ((8, 0), (10, 99)),
+    "int8": ((8, 0), (10, 99)),
+    "precisionConstraints": ((8, 4), (10, 99)),
+    "layerPrecisions": ((8, 4), (10, 99)),
+}
+"""Options by the first and the last release that takes them, from NVIDIA's guides to migration."""
+
+
+def release() -> tuple[int, int]:
+    base = 10000 if len(RELEASE) > 4 else 1000
+    return int(RELEASE) // base, int(RELEASE) % base // (base // 100 if base == 10000 else 100)
+
+
+def unknown(options: dict[str, str]) -> list[str]:
+    known = {name for name, (first, last) in SOME.items() if first <= release() <= last}
+    return [name for name in options if name not in known | set(ALWAYS.split())]
+
+
+def inferred(graph: Path, options: dict[str, str]) -> None:
+    """Writes what the graph says of the inputs that were given, as `trtexec` writes it."""
+    import numpy as np
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    files = dict(pair.split(":") for pair in options["loadInputs"].split(","))
+    inputs = {
+        given.name: np.fromfile(files[given.name], "<f4").reshape(given.shape)
+        for given in session.get_inputs()
+    }
+    rows = [
+        {"name": output.name, "dimensions": "x".join(map(str, values.shape)), "values": values}
+        for output, values in zip(session.get_outputs(), session.run(None, inputs), strict=True)
+    ]
+    for row in rows:
+        row["values"] = row["values"].ravel().tolist()
+    Path(options["exportOutput"]).write_text(json.dumps(rows))
 
 
 def say(*lines: str) -> None:
@@ -53,6 +100,29 @@ def timed(graph: Path, seconds: float) -> float:
     return median(times)
 
 
+def refusal(options: dict[str, str], graph: Path) -> str | None:
+    """Why no engine is made or run."""
+    if unknown(options):
+        return f"Unknown option: --{unknown(options)[0]}"
+    if graph.name in os.environ.get("KIT_FAILS", "").split(","):
+        return "Error[10]: no implementation for a node"
+    return None
+
+
+def exported(options: dict[str, str], graph: Path, ms: float) -> None:
+    """Writes the files that were asked for."""
+    for made in ("timingCacheFile", "exportLayerInfo"):
+        if made in options:
+            Path(options[made]).touch()
+    if "saveEngine" in options:
+        Path(options["saveEngine"]).write_text(str(graph))
+    if "exportOutput" in options:
+        inferred(graph, options)
+    if "exportTimes" in options:
+        runs = [{"computeMs": ms, "latencyMs": 1.7 * ms}] * int(options["iterations"])
+        Path(options["exportTimes"]).write_text(json.dumps(runs))
+
+
 def main() -> int:
     words = [word for word in sys.argv[1:] if word.startswith("--")]
     options = dict(word[2:].partition("=")[::2] for word in words)
@@ -63,16 +133,16 @@ def main() -> int:
             calls.write(" ".join(sys.argv[1:]) + "\n")
     engine = options.get("loadEngine")
     graph = Path(options["onnx"] if engine is None else Path(engine).read_text())
-    if graph.name in os.environ.get("KIT_FAILS", "").split(","):
-        sys.stdout.write("[11/22/2026-10:00:00] [E] Error[10]: no implementation for a node\n")
+    reason = refusal(options, graph)
+    if reason is not None:
+        sys.stdout.write(f"[11/22/2026-10:00:00] [E] {reason}\n")
         say(f"&&&& FAILED {told}")
         return 1
     assert graph.read_bytes()
-    if "saveEngine" in options:
-        Path(options["saveEngine"]).write_text(str(graph))
     planted = os.environ.get("KIT_TIMES")
     known = json.loads(Path(planted).read_text()) if planted else {}
-    ms = known[graph.name] if planted else timed(graph, float(options["duration"]))
+    ms = known[graph.name] if planted else timed(graph, float(options.get("duration", 3)))
+    exported(options, graph, ms)
     spread = float(os.environ.get("KIT_SPREAD", "0.02"))
     say("=== Performance summary ===", f"Throughput: {900 / ms:g} qps")
     names = ["Latency", "End-to-End Host Latency", "Enqueue Time", "H2D Latency"]

@@ -215,6 +215,10 @@ def test_times_that_are_far_apart_are_repeated_then_told(device: Device) -> None
 )
 def test_the_version_is_read_from_the_log(device: Device, release: str, version: str) -> None:
     device.keep(1)
+    if version == "10.3.0":  # has no --workspace any more
+        script = device.folder / "run.sh"
+        pools = script.read_text().replace("--workspace=", "--memPoolSize=workspace:")
+        script.write_text(pools)
     device.run(KIT_RELEASE=release)
     assert {row["version"] for row in device.results()["rows"]} == {version}
 
