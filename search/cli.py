@@ -1,4 +1,7 @@
-"""The commands that find a network and write what deploys it: rts2-search and rts2-deploy."""
+"""The commands that find a network and write what deploys it: rts2-search and rts2-deploy.
+
+rts2-deploy's own half is `deploy/cli.py`.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,10 @@ import argparse
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
-from ..model.arch import UNTRAINED, Precision
-from ..model.box import holding, in_box, judged, listed, named_model
+from ..model.arch import Precision
+from ..model.bundle import CONFIGURATION
 from ..model.console import (
     KITTI,
     add_output,
@@ -19,22 +22,20 @@ from ..model.console import (
     print_json,
     resolution,
     screen,
-    seed,
 )
 from ..model.errors import NothingFeasible, UsageError
-from ..model.files import filling_folder, output_folder, remove, write_bytes, write_json
+from ..model.files import output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
 from ..profiles.here import differences
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import source
-from .deploy.bundle import next_step, runtime_of, stale, write
-from .deploy.configuration import Deployment, as_judged, of_arch, of_point
+from .deploy.cli import deploy
+from .deploy.configuration import of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
-from .result import Found, Task, read
+from .result import Found, Task
 
-if TYPE_CHECKING:
-    from ..model.checkpoint import Network
+__all__ = ["deploy", "search"]
 
 
 @command
@@ -149,137 +150,11 @@ def _write(found: Found, profile: Profile, out: Path) -> list[str]:
     save(found, profile.title, out / "front.png")
     written = [f"{out}/", "front.json", "front.csv", "front.png"]
     if found.selected is None:
-        remove(out / "deployment.json")
+        remove(out / CONFIGURATION)
         return written
     configuration = of_point(found.selected, found, profile)
-    write_json(out / "deployment.json", configuration.model_dump(mode="json", by_alias=True))
-    return [*written, "deployment.json"]
-
-
-@command
-def deploy(arguments: Sequence[str] | None = None) -> int:
-    """Writes the folder that runs a network on a device."""
-    options = _deploy_parser().parse_args(arguments)
-    profile = load(options.device)
-    asked = _asked(options, profile)
-    path = options.model or (None if options.untrained else _boxed(asked))
-    network, origin = _weights(path, options, asked)
-    if asked is None:
-        size = options.resolution or KITTI
-        asked = of_arch(network.arch, profile, "fp32", runtime_of(profile).runtime, size)
-    elif path is not None and in_box(path) and asked.expected is not None:
-        expected = as_judged(asked.expected, judged(path, asked.arch))
-        asked = asked.model_copy(update={"expected": expected})
-    leftover = stale(options.out)
-    with filling_folder(options.out, "deployment.json") as folder:
-        complete = write(network, asked, profile, origin, folder)
-    for path in leftover:
-        if path.name not in {file.name for file in complete.files}:
-            remove(path)
-    if options.json:
-        print_json(complete.model_dump(mode="json", by_alias=True))
-        return 0
-    what = f"{complete.arch.label()} for {profile.title}, {complete.precision}, weights {origin}"
-    names = "  ".join([file.name for file in complete.files] + ["deployment.json"])
-    for line in (
-        what,
-        f"written   {options.out}/  {names}",
-        f"next      on the device: {next_step(complete.runtime)}",
-    ):
-        screen().print(line, soft_wrap=True)
-    return 0
-
-
-def _deploy_parser() -> argparse.ArgumentParser:
-    described = parser(
-        "rts2-deploy",
-        "Writes the folder that runs a network on a device: the ONNX graph, its configuration, "
-        "how to build it there and how to check it there.",
-        "rts2-deploy --front rts2-out/front.json --device tx2",
-    )
-    add = described.add_argument
-    add("--device", required=True, help=f"{', '.join(names())}, or a device profile's JSON file")
-    text = "a search's result: its pick is deployed"
-    add("--front", type=Path, metavar="front.json", help=text)
-    text = "deploy the front's prospect instead of its pick"
-    add("--prospect", action="store_true", help=text)
-    text = (
-        "a checkpoint, or the name of a network in the box; with --front it must hold the pick's "
-        "arch, and is cut to it (default: the network in the box that holds it)"
-    )
-    add("--model", type=named_model, metavar="CHECKPOINT", help=text)
-    text = "random weights, to try speed and integration without a trained network"
-    add("--untrained", action="store_true", help=text)
-    add("--seed", type=seed, default=0, help="of the random weights (default: 0)")
-    text = "image size, WxH (default: the search's, else 1242x375)"
-    add("--resolution", type=resolution, metavar="WxH", help=text)
-    add_output(described, out="rts2-bundle")
-    return described
-
-
-def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
-    """The configuration that the front asks for; None without a front."""
-    if options.front is None:
-        if options.model is None:
-            raise UsageError("give --front front.json, --model CHECKPOINT, or both")
-        if options.prospect:
-            raise UsageError("--prospect is a front's; give --front front.json")
-        return None
-    found = read(options.front)
-    if found.device != profile.name:
-        raise UsageError(
-            f"{options.front} was searched for {found.device}, not for {profile.name}; "
-            "search again for that device"
-        )
-    if options.resolution not in (None, found.resolution):
-        width, height = found.resolution
-        raise UsageError(f"{options.front} was searched at {width}x{height}; search again")
-    point = found.prospect if options.prospect else found.selected
-    if point is None:
-        role = "prospect" if options.prospect else "pick"
-        raise NothingFeasible(f"{options.front} has no {role}; search with another target")
-    return of_point(point, found, profile)
-
-
-def _boxed(asked: Deployment | None) -> Path:
-    """The network in the box that holds what the front asks for."""
-    assert asked is not None, "without a model there is a front"
-    path = holding(asked.arch)
-    if path is None:
-        raise UsageError(
-            f"no network in the box holds {asked.arch.label()}; {listed()}: give --model "
-            "CHECKPOINT (rts2-train makes one), or say --untrained for random weights"
-        )
-    return path
-
-
-def _weights(
-    path: Path | None, options: argparse.Namespace, asked: Deployment | None
-) -> tuple[Network, str]:
-    """The network to deploy, random without a path, and where its weights come from."""
-    from ..model.checkpoint import build, cut
-    from ..model.checkpoint import load as load_checkpoint
-
-    if path is None:
-        import torch
-
-        assert asked is not None, "without a model there is a front"
-        torch.manual_seed(options.seed)
-        return build(asked.arch), UNTRAINED
-    network, header = load_checkpoint(path)
-    if not header.trained and not options.untrained:
-        raise UsageError(f"{path} is untrained; --untrained deploys it all the same")
-    if asked is None:
-        return network, header.origin
-    part = cut(network, asked.arch)
-    if options.model is not None:
-        return part, header.origin
-    logging.getLogger(__name__).warning(
-        "note: the accuracy that the search promises needs the training that it rests on; "
-        "the weights of %s were %s (rts2-eval judges them, rts2-train --init %s goes on)",
-        *(path.stem, header.origin, path.stem),
-    )
-    return part, f"{path.stem} of the box, {header.origin}"
+    write_json(out / CONFIGURATION, configuration.model_dump(mode="json", by_alias=True))
+    return [*written, CONFIGURATION]
 
 
 def _infeasible(found: Found, profile: Profile) -> str:

@@ -1,119 +1,20 @@
-"""deployment.json: everything that the target needs to know of the network that it runs."""
+"""deployment.json of a point or an arch, before any file exists, and reading it back."""
 
 from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from ...model.arch import MEAN, STD, Arch, Form, Precision
+from ...model.arch import Arch, Form, Precision
 from ...model.box import Figures
+from ...model.data.labels import CLASS_NAMES
 from ...model.files import read_json, sha256
 from ...model.ops import padded
-from ...profiles.evidence import Evidence
 from ...profiles.latency import fastest_forms
 from ...profiles.profile import Profile, Resolution, Runtime
 from ..result import Found
 from ..result import Point as FrontPoint
-
-Triple = tuple[float, float, float]
-
-
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
-
-
-class Input(_Frozen):
-    """How an image becomes an input: the same for `left` and `right`."""
-
-    names: tuple[str, str] = ("left", "right")
-    resolution: Resolution
-    """Width and height of the camera's images."""
-    shape: tuple[int, int, int, int]
-    """Batch, channels, height, width: the resolution, padded."""
-    dtype: Literal["float32"] = "float32"
-    channels: Literal["RGB"] = "RGB"
-    scale: float = 1 / 255
-    """Bytes are brought to 0 … 1 by it, then normalised."""
-    mean: Triple = MEAN
-    std: Triple = STD
-    padding: str = "zeros at the right and at the bottom, after normalising"
-
-
-class Output(_Frozen):
-    """What comes back; the padding is cut off again."""
-
-    name: str
-    shape: tuple[int, int, int]
-    dtype: Literal["float32", "int32"]
-    meaning: str
-
-
-class ExpectedEvidence(_Frozen):
-    """Where the latency and the accuracies come from."""
-
-    latency: Evidence
-    accuracy: Evidence | None
-    """None where no accuracy is known of the weights."""
-
-
-class Expected(_Frozen):
-    """What was promised, of which runtime, and on what evidence."""
-
-    runtime: Runtime
-    fps: float
-    fps_low: float
-    fps_high: float
-    confidence: float
-    latency_ms: float
-    d1_all: float | None
-    epe: float | None
-    miou: float | None
-    evidence: ExpectedEvidence
-    judged_on: str | None = None
-    """What measured the accuracies of these very weights; None where nothing did."""
-    boundary: str = "one pair, batch 1, the network alone, median latency"
-
-
-class Check(_Frozen):
-    """What the check script compares: little-endian float32, shaped like the inputs and outputs."""
-
-    inputs: tuple[str, str] = ("sample_left.bin", "sample_right.bin")
-    disparity: str = "sample_disparity.bin"
-    tolerance_px: float
-    """What the runtime may differ from PyTorch, on average."""
-
-
-class File(_Frozen):
-    """One file of the bundle."""
-
-    name: str
-    size_bytes: Annotated[int, Field(ge=0)]
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-
-
-class Deployment(_Frozen):
-    """The configuration of one deployed network: schema rts2.deployment/1."""
-
-    schema_: Literal["rts2.deployment/1"] = Field(default="rts2.deployment/1", alias="schema")
-    device: str
-    target_fps: float | None
-    arch: Arch
-    precision: Precision
-    runtime: Runtime
-    forms: tuple[Form, ...] | None = None
-    """Of each stage's 3D convs in the graph: the faster ones there; None where all are 3d."""
-    input: Input
-    outputs: tuple[Output, ...]
-    expected: Expected | None
-    """None where no search promised anything."""
-    weights: str | None
-    """How the weights came to be; None while there are none."""
-    check: Check | None = None
-    files: tuple[File, ...]
-    versions: dict[str, str]
+from .schema import Deployment, Expected, ExpectedEvidence, File, Input, Output, Postprocessing
 
 
 def of_point(point: FrontPoint, found: Found, profile: Profile) -> Deployment:
@@ -185,6 +86,7 @@ def of_arch(
         forms=_forms(arch, profile, precision, runtime, resolution),
         input=Input(resolution=resolution, shape=(1, 3, height, width)),
         outputs=tuple(outputs),
+        postprocessing=Postprocessing(crop=resolution, classes=_class_names(arch)),
         expected=None,
         weights=None,
         files=(),
@@ -204,9 +106,15 @@ def _forms(
     return None
 
 
-def describe(path: Path) -> File:
-    """A file's name, size and hash."""
-    return File(name=path.name, size_bytes=path.stat().st_size, sha256=sha256(path))
+def _class_names(arch: Arch) -> tuple[str, ...]:
+    """What the class ids mean; nobody knows it of another number of classes."""
+    return CLASS_NAMES if arch.semantic and arch.classes == len(CLASS_NAMES) else ()
+
+
+def describe(path: Path, folder: Path) -> File:
+    """A file's name within its bundle, its size and its hash."""
+    name = path.relative_to(folder).as_posix()
+    return File(name=name, size_bytes=path.stat().st_size, sha256=sha256(path))
 
 
 def read(path: Path) -> Deployment:

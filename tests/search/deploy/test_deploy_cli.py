@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch import nn
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, cut, load, save
 from rts2.model.export import Deployed, parity
+from rts2.model.files import sha256
 from rts2.model.graph import read_header
 from rts2.profiles.profile import load as load_profile
 from rts2.search.cli import deploy, search
@@ -142,10 +144,8 @@ def test_the_pick_becomes_a_folder(run: Any, front: Callable[..., Path], device:
     assert (ended.code, ended.err) == (0, "")
     deployment = read(ended.folder / "deployment.json")
     assert (deployment.device, deployment.arch, deployment.weights) == (device, PICK, "untrained")
-    assert {path.name for path in ended.folder.iterdir()} == {
-        *(file.name for file in deployment.files),
-        "deployment.json",
-    }
+    listed = {file.name for file in deployment.files}
+    assert entries(ended.folder).keys() == listed | {"deployment.json"}
     for name in ("deployment.json", *(file.name for file in deployment.files)):
         assert name in ended.out
     assert ("sh build.sh" in ended.out) == (device != "cpu")
@@ -171,9 +171,12 @@ def test_the_front_of_a_real_search_is_deployed(
     told = run("--device", "cpu", "--front", path, "--untrained", "--json").json
     assert told["arch"] == selected["arch"]
     assert told["expected"]["fps"] == selected["fps"]
-    for key in ("weights", "files", "check"):
+    for key in ("weights", "files", "check", "execution", "layers"):
         assert told.pop(key)
         assert not configured.pop(key)
+    assert bool(told.pop("calibration")["images"]) == (selected["precision"] == "int8")
+    assert configured.pop("calibration")["images"] == []
+    assert told.pop("versions").items() > configured.pop("versions").items()
     assert told == configured
 
 
@@ -190,7 +193,9 @@ def test_the_seed_decides_random_weights(run: Any, front: Callable[..., Path]) -
         hashes.append({file["name"]: file["sha256"] for file in told["files"]})
     assert hashes[0] == hashes[1]
     changed = {name for name in hashes[0] if hashes[0][name] != hashes[2][name]}
-    assert changed == {"model.onnx", "sample_disparity.bin"}
+    samples = ("samples/val-000000", "samples/val-000001")
+    maps = {f"{sample}/{name}.bin" for sample in samples for name in ("disparity", "semantic")}
+    assert changed == {"model.onnx", *maps}
 
 
 def test_a_checkpoint_is_cut_to_the_pick_and_answers_the_same(
@@ -222,6 +227,42 @@ def test_a_checkpoint_alone_promises_nothing(run: Any, checkpoint: Callable[...,
     assert told["arch"] == PROSPECT.model_dump(mode="json")
     assert (told["input"]["resolution"], told["input"]["shape"]) == ([90, 60], [1, 3, 64, 96])
     assert "No search promised" in (run(*asked).folder / "README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("device", "options", "runtime"),
+    [
+        ("cpu", ("--precision", "int8"), "onnxruntime"),
+        ("rtx2080ti", ("--precision", "fp16", "--tensorrt", "10"), "tensorrt"),
+        ("rtx2080ti", ("--runtime", "tensorrt"), "tensorrt"),
+    ],
+)
+def test_without_a_front_precision_runtime_and_generation_can_be_said(
+    run: Any,
+    checkpoint: Callable[..., Path],
+    device: str,
+    options: tuple[str, ...],
+    runtime: str,
+) -> None:
+    asked = ("--device", device, "--model", checkpoint(PROSPECT), "--resolution", "96x64")
+    told = run(*asked, *options, "--json").json
+    given = dict(zip(options[::2], options[1::2], strict=True))
+    assert told["precision"] == given.get("--precision", "fp32")
+    assert told["runtime"] == told["execution"]["runtime"] == runtime
+    if runtime == "tensorrt":
+        assert told["execution"]["generation"] == given.get("--tensorrt", "8.2")
+
+
+def test_what_a_device_does_not_have_without_a_front_is_refused(
+    run: Any, checkpoint: Callable[..., Path]
+) -> None:
+    asked = ("--device", "cpu", "--model", checkpoint(PROSPECT), "--resolution", "96x64")
+    refused(run(*asked, "--runtime", "openvino"), 2, "rts2-profile fit --runtime openvino adds it")
+    refused(run(*asked, "--precision", "bf16"), 2, "runs fp32 or int8 on onnxruntime, not bf16")
+    refused(run(*asked, "--tensorrt", "10"), 2, "--tensorrt is for TensorRT")
+    tx2 = ("--device", "tx2", *asked[2:])
+    refused(run(*tx2, "--tensorrt", "11"), 2, "runs TensorRT 8.2, not 11")
+    refused(run(*tx2, "--precision", "int8"), 2, "sm_62 has no DP4A", "use fp16")
 
 
 def test_a_network_in_the_box_goes_by_its_name(
@@ -288,7 +329,7 @@ def test_weights_of_the_box_promise_what_they_were_judged_to_reach(
     assert told["evidence"] == {"latency": "interpolated", "accuracy": "measured"}
     assert told["judged_on"] == "kitti2015 all, 3 frames, in fp32"
     assert (told["fps"], told["latency_ms"]) == (25, 40)
-    text = (ended.folder / "README.md").read_text()
+    text = " ".join((ended.folder / "README.md").read_text().split())
     assert "theirs, judged on kitti2015 all, 3 frames" in text
 
 
@@ -314,7 +355,7 @@ def test_weights_of_others_keep_the_promise_of_the_search(
     asked = ("--device", "cpu", "--front", front("cpu"), "--model", checkpoint())
     told = run(*asked, "--json").json["expected"]
     assert (told["d1_all"], told["evidence"]["accuracy"]) == (5.5, "published")
-    text = (run(*asked).folder / "README.md").read_text()
+    text = " ".join((run(*asked).folder / "README.md").read_text().split())
     assert "those of the search's source, not of these weights" in text
 
 
@@ -360,6 +401,7 @@ def test_a_front_that_does_not_fit_is_refused_and_nothing_is_written(
     run: Any, front: Callable[..., Path], tmp_path: Path
 ) -> None:
     tx2 = front("tx2")
+    asked = ("--device", "tx2", "--front", tx2)
     without = front("cpu", selected=None, prospect=None)
     cases: list[tuple[int, str, tuple[object, ...]]] = [
         (2, "searched for tx2, not for cpu", ("--device", "cpu", "--front", tx2)),
@@ -370,6 +412,10 @@ def test_a_front_that_does_not_fit_is_refused_and_nothing_is_written(
         (2, "no such file", ("--device", "cpu", "--model", tmp_path / "none.safetensors")),
         (2, "unknown device", ("--device", "toaster", "--front", tx2)),
         (2, "--device", ("--front", tx2)),
+        (2, "--precision is the front's", (*asked, "--precision", "fp16")),
+        (2, "--runtime is the front's", (*asked, "--runtime", "tensorrt")),
+        (2, "--tensorrt", (*asked, "--tensorrt", "7")),
+        (2, "--target", (*asked, "--target", "toaster")),
         (2, "--front front.json, --model CHECKPOINT", ("--device", "cpu")),
         (2, "must be WxH", ("--device", "cpu", "--front", tx2, "--resolution", "96")),
         (2, "--seed", ("--device", "tx2", "--front", tx2, "--seed", "x")),
@@ -409,9 +455,9 @@ def test_an_earlier_bundle_is_replaced_file_by_file(run: Any, front: Callable[..
     again = run("--device", "tx2", "--front", front("tx2"), "--untrained", "--seed", 2)
     after = entries(again.folder)
     assert after.keys() == before.keys()
-    assert {name for name in after if after[name] != before[name]} == {
-        *("deployment.json", "model.onnx", "sample_disparity.bin"),
-    }
+    changed = {name for name in after if after[name] != before[name]}
+    assert {"deployment.json", "model.onnx", "samples/val-000001/disparity.bin"} <= changed
+    assert not changed & {"build.sh", "verify.py", "samples/val-000000/left.ppm"}
 
 
 def test_deploying_into_the_searchs_folder_keeps_the_front(
@@ -463,12 +509,97 @@ def test_only_what_an_earlier_bundle_left_is_cleared(
     """A TX2's engine and its build script go with its bundle; the user's own files stay."""
     folder = tmp_path / "bundle"
     folder.mkdir()
-    (folder / "output.json").write_text("mine")
-    run("--device", "tx2", "--front", front("tx2"), "--untrained", out=folder)
-    assert (folder / "output.json").read_text() == "mine"
+    (folder / "layers.json").write_text("mine")
+    tx2 = ("--device", "tx2", "--front", front("tx2"), "--untrained")
+    run(*tx2, "--target", "triton", out=folder)
+    assert (folder / "layers.json").read_text() == "mine"
+    assert (folder / "triton").is_dir()
     (folder / "model.plan").write_text("an engine")
     (folder / "notes.txt").write_text("mine")
     run("--device", "cpu", "--front", front("cpu"), "--untrained", out=folder)
     left = {path.name for path in folder.iterdir()}
     assert "notes.txt" in left
-    assert not left & {"model.plan", "build.sh", "output.json"}
+    assert not left & {"model.plan", "build.sh", "layers.json", "triton"}
+
+
+@pytest.fixture
+def verify(capsys: pytest.CaptureFixture[str]) -> Any:
+    def command(folder: Path, *options: str) -> Run:
+        code = deploy(["verify", str(folder), *options])
+        printed = capsys.readouterr()
+        return Run(code, printed.out, printed.err, folder)
+
+    return command
+
+
+def rehash(folder: Path, known: dict[str, Any]) -> None:
+    """Makes a configuration agree with what a test has done to the files."""
+    for file in known["files"]:
+        file["sha256"] = sha256(folder / file["name"])
+    (folder / "deployment.json").write_text(json.dumps(known))
+
+
+@pytest.fixture
+def made(run: Any, front: Callable[..., Path]) -> Path:
+    folder: Path = run("--device", "cpu", "--front", front("cpu"), "--untrained").folder
+    return folder
+
+
+def test_a_bundle_is_verified_here(verify: Any, made: Path) -> None:
+    ended = verify(made)
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.endswith("ok\n")
+    assert "expected  25.0 FPS" in ended.out
+    told = verify(made, "--json").json
+    assert (told["schema"], told["ok"]) == ("rts2.verification/1", True)
+
+
+def test_a_bundle_that_was_changed_is_not_run(verify: Any, made: Path) -> None:
+    script = made / "verify.py"
+    script.write_text("raise SystemExit('was run')")
+    refused(verify(made), 1, "verify.py is not the file that deployment.json tells the hash of")
+    script.unlink()
+    refused(verify(made), 1, "holds no verify.py; make the bundle again")
+
+
+def test_what_verify_py_finds_fails_the_command(verify: Any, made: Path) -> None:
+    known = json.loads((made / "deployment.json").read_text())
+    known["versions"]["onnxruntime"] = "1.2.3"
+    expected = made / "samples" / "val-000001" / "disparity.bin"
+    expected.write_bytes(bytes(expected.stat().st_size))
+    rehash(made, known)
+    ended = verify(made)
+    assert ended.code == 1
+    assert "written with onnxruntime 1.2.3" in ended.out
+    assert "FAILED: the answers are too far off" in ended.err
+    assert ended.err.count("\n") == 1
+    ended = verify(made, "--json")
+    assert (ended.code, json.loads(ended.out)["ok"]) == (1, False)
+
+
+def test_a_bundle_for_another_device_is_one_line(
+    run: Any, verify: Any, front: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = run("--device", "tx2", "--front", front("tx2"), "--untrained").folder
+    monkeypatch.setenv("TRTEXEC", "/none/trtexec")
+    said = "trtexec is not at /none/trtexec: this bundle runs on tx2 with TensorRT 8.2"
+    for options in ((), ("--json",)):
+        refused(verify(folder, *options), 1, said)
+
+
+def test_weights_in_another_file_that_is_missing_are_named(verify: Any, made: Path) -> None:
+    graph = made / "model.onnx"
+    model = onnx.load(graph)
+    options = {"save_as_external_data": True, "location": "weights.bin", "size_threshold": 1000}
+    onnx.save_model(model, graph, **options)
+    rehash(made, json.loads((made / "deployment.json").read_text()))
+    assert verify(made).code == 0
+    (made / "weights.bin").unlink()
+    refused(verify(made), 1, "keeps weights in weights.bin, which is missing; copy the whole")
+
+
+def test_what_is_no_bundle_is_not_verified(verify: Any, tmp_path: Path) -> None:
+    refused(verify(tmp_path), 2, "it is a folder without deployment.json")
+    refused(verify(tmp_path / "none"), 2, "it is no folder")
+    (tmp_path / "deployment.json").write_text("{}")
+    refused(verify(tmp_path), 1, "a deployment configuration")

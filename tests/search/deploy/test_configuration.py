@@ -10,7 +10,8 @@ from rts2.model.errors import Rts2Error, UsageError
 from rts2.profiles.parts import PartModel
 from rts2.profiles.profile import load
 from rts2.search.accuracy import source
-from rts2.search.deploy.configuration import Deployment, describe, of_arch, of_point, read
+from rts2.search.deploy.configuration import describe, of_arch, of_point, read
+from rts2.search.deploy.schema import Deployment, json_schema
 from rts2.search.exhaustive import Question, search
 from rts2.search.result import Found
 from rts2.search.space import Space
@@ -41,6 +42,7 @@ def test_a_point_becomes_its_configuration_number_by_number(found: Found) -> Non
     assert expected.fps >= 5
     assert expected.latency_ms == pytest.approx(1000 / expected.fps)
     assert (made.weights, made.check, made.files) == (None, None, ())
+    assert (made.execution, made.layers, made.calibration.images) == (None, (), ())
 
 
 def test_it_passes_through_its_file(found: Found, tmp_path: Path) -> None:
@@ -71,6 +73,7 @@ def test_the_input_is_padded_to_what_the_family_needs(
     assert {output.shape for output in made.outputs} == {(1, *size)}
     assert (made.input.mean, made.input.std) == (MEAN, STD)
     assert made.input.scale * 255 == 1
+    assert made.postprocessing.crop == resolution
     assert (made.expected, made.target_fps) == (None, None)
 
 
@@ -80,13 +83,16 @@ def test_the_outputs_are_those_of_the_branches() -> None:
         made = of_arch(arch, load("cpu"), "fp32", "onnxruntime", (96, 64))
         assert [output.name for output in made.outputs] == names
         assert [output.dtype for output in made.outputs] == ["float32", "int32"][: len(names)]
+        assert made.postprocessing.classes[:2] == (("road", "sidewalk") if semantic else ())
+        assert len(made.postprocessing.classes) == (19 if semantic else 0)
 
 
 def test_a_file_is_described_by_its_bytes(tmp_path: Path) -> None:
-    path = tmp_path / "model.onnx"
+    path = tmp_path / "triton" / "model.onnx"
+    path.parent.mkdir()
     path.write_bytes(b"abc")
-    told = describe(path)
-    assert (told.name, told.size_bytes) == ("model.onnx", 3)
+    told = describe(path, tmp_path)
+    assert (told.name, told.size_bytes) == ("triton/model.onnx", 3)
     assert told.sha256 == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
@@ -98,6 +104,10 @@ def test_a_file_is_described_by_its_bytes(tmp_path: Path) -> None:
         ("runtime", "abacus"),
         ("arch", {"c": 0}),
         ("files", [{"name": "x", "size_bytes": -1, "sha256": "0" * 64}]),
+        ("files", [{"name": "../x", "size_bytes": 1, "sha256": "0" * 64}]),
+        ("execution", {"runtime": "abacus"}),
+        ("layers", [{"layer": "x", "precision": "fp32"}]),
+        ("triton", {"repository": "/srv", "name": "x"}),
         ("files", [{"name": "x", "size_bytes": 1, "sha256": "no"}]),
         ("more", 1),
     ],
@@ -142,3 +152,17 @@ def test_the_graph_holds_its_3d_convs_as_the_device_runs_them_fastest() -> None:
     assert found == [None, ("3d", "banded", "3d")]
     anynet = of_arch(Arch(family="anynet", c=1), known, "fp32", "onnxruntime", (1242, 375))
     assert anynet.forms is None
+
+
+def test_the_published_schema_is_the_one_that_is_used() -> None:
+    """It is `json_schema()`, indented by 2: write that there where the schema has changed."""
+    path = Path(__file__).parents[3] / "docs" / "deployment.schema.json"
+    assert json.loads(path.read_text(encoding="utf-8")) == json_schema()
+
+
+def test_every_field_of_the_schema_is_documented() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "deployment.md").read_text(encoding="utf-8")
+    told = json_schema()
+    assert all(f"`{name}`" in page for name in told["properties"])
+    for part in ("Check", "Sample", "LayerPrecision", "Calibration", "Postprocessing"):
+        assert all(f"`{name}`" in page for name in told["$defs"][part]["properties"]), part
