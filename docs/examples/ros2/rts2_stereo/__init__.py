@@ -1,0 +1,1 @@
+"""Disparity from a stereo camera, by a network of rts2."""
