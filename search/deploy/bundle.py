@@ -129,8 +129,11 @@ def stale(folder: Path) -> tuple[Path, ...]:
     if not (folder / CONFIGURATION).is_file():
         return ()
     known = contents(folder)
-    left = [name for target in TARGETS.values() for name in target.leaves] if known else []
-    return tuple(folder / name for name in (*(file.name for file in known), *left))
+    if not known:
+        return ()
+    names = [file.name for file in known]
+    left = (name for target in TARGETS.values() for name in target.leaves)
+    return tuple(folder / name for name in (*names, *left, *triton.plans(names)))
 
 
 def script() -> str:

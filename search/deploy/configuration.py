@@ -7,7 +7,6 @@ from pathlib import Path
 
 from ...model.arch import Arch, Form, Precision
 from ...model.box import Figures
-from ...model.data.labels import CLASS_NAMES
 from ...model.files import read_json, sha256
 from ...model.ops import padded
 from ...profiles.latency import fastest_forms
@@ -108,6 +107,8 @@ def _forms(
 
 def _class_names(arch: Arch) -> tuple[str, ...]:
     """What the class ids mean; nobody knows it of another number of classes."""
+    from ...model.data.labels import CLASS_NAMES
+
     return CLASS_NAMES if arch.semantic and arch.classes == len(CLASS_NAMES) else ()
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ...model.data.catalog import STREETS, open_dataset
 from ...model.files import write_bytes
 from .schema import Check, Sample
 from .target import Tolerance
@@ -27,6 +26,8 @@ PERCENTILE: Final = 99.0
 
 def scenes(size: tuple[int, int]) -> list[Scene]:
     """The pairs at a size (width, height)."""
+    from ...model.data.catalog import STREETS, open_dataset
+
     return [sample.read() for sample in open_dataset(STREETS, split="val", count=PAIRS, size=size)]
 
 

@@ -8,7 +8,7 @@ triton/rts2net/1/model.plan      TensorRT: put there by build.sh
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 from ...model.arch import Arch
@@ -19,6 +19,7 @@ from ...profiles.profile import Runtime
 from .schema import Deployment, OrtExecution, TritonModel
 
 REPOSITORY: Final = "triton"
+CONFIG: Final = "config.pbtxt"
 
 FILES: Final[dict[Runtime, str]] = {"onnxruntime": MODEL, "tensorrt": "model.plan"}
 """What a backend of Triton runs, by runtime; the backends have the same names."""
@@ -44,11 +45,17 @@ def file(known: TritonModel, runtime: Runtime) -> str:
     return f"{known.repository}/{known.name}/1/{FILES[runtime]}"
 
 
+def plans(names: Iterable[str]) -> list[str]:
+    """Where build.sh has put engines into the repositories among the files of a bundle."""
+    roots = (PurePosixPath(name).parent for name in names if name.endswith(CONFIG))
+    return [str(root / "1" / FILES["tensorrt"]) for root in roots]
+
+
 def write(folder: Path, deployment: Deployment, known: TritonModel) -> None:
     """Writes the repository of a deployment that knows its execution into its bundle."""
     root = folder / known.repository / known.name
     root.mkdir(parents=True)
-    write_bytes(root / "config.pbtxt", config(deployment, known).encode())
+    write_bytes(root / CONFIG, config(deployment, known).encode())
     if FILES[deployment.runtime] == MODEL:
         copy = folder / file(known, deployment.runtime)
         copy.parent.mkdir()

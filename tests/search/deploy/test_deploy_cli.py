@@ -514,7 +514,10 @@ def test_only_what_an_earlier_bundle_left_is_cleared(
     run(*tx2, "--target", "triton", out=folder)
     assert (folder / "layers.json").read_text() == "mine"
     assert (folder / "triton").is_dir()
-    (folder / "model.plan").write_text("an engine")
+    engines = [folder / "model.plan", folder / "triton" / "rts2net" / "1" / "model.plan"]
+    for engine in engines:
+        engine.parent.mkdir(exist_ok=True)
+        engine.write_text("an engine")
     (folder / "notes.txt").write_text("mine")
     run("--device", "cpu", "--front", front("cpu"), "--untrained", out=folder)
     left = {path.name for path in folder.iterdir()}
