@@ -21,9 +21,10 @@ from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
 from .forms import class_ids, formed, forms_run, rewritten
-from .graph import GraphHeader, read_header, save_graph
+from .graph import DISPARITY, SEMANTIC, GraphHeader, answers, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
+from .rts2net import Stage
 
 OPSETS = range(13, 21)
 """From the first in which softmax works along one axis, to the exporter's last."""
@@ -59,7 +60,9 @@ class Deployed(nn.Module):
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
         """(B, 3, H, W) twice, normalised → disparity (B, H, W) in pixels, class ids (B, H, W)."""
-        stage = self.network(left, right, self.arch.stages)[-1]
+        return self._answer(self.network(left, right, self.arch.stages)[-1])
+
+    def _answer(self, stage: Stage) -> tuple[Tensor, ...]:
         disparity = self._full(stage.best).flatten(0, 1)
         if stage.scores is None:
             return (disparity,)
@@ -73,13 +76,23 @@ class Deployed(nn.Module):
 
 
 class Exported(Deployed):
-    """The same as a graph holds it: in forms that give the same and are faster there."""
+    """The same as a graph holds it: in forms that give the same and are faster there.
+
+    Behind the answer it tells those of the earlier stages, as `answers` names them.
+    """
 
     def __init__(
         self, network: Network, stages: int | None = None, forms: Sequence[Form] | None = None
     ) -> None:
         super().__init__(network, stages, forms)
         self.network = rewritten(self.network)
+
+    def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
+        *earlier, last = self.network(left, right, self.arch.stages)
+        told = [(stage.best, stage.scores) for stage in earlier]
+        return self._answer(last) + tuple(
+            maps for pair in told for maps in pair if maps is not None
+        )
 
     def _classes(self, scores: Tensor) -> Tensor:
         return class_ids(scores, self.factor)
@@ -138,9 +151,11 @@ def parity(path: Path, network: Network, left: Tensor, right: Tensor) -> Parity:
 def _traced(deployed: Deployed, header: GraphHeader, opset: int) -> onnx.ModelProto:
     """The network as a folded ONNX model at the padded size."""
     width, height = header.size
+    arch = header.arch
+    outputs = [DISPARITY, SEMANTIC] if arch.semantic else [DISPARITY]
+    inner = [name for stage in range(1, arch.stages) for name in answers(stage, arch.semantic)]
     # Two images that differ: of equal ones the exporter would make a single input.
     pair = torch.rand(2, 1, 3, height, width, generator=torch.Generator().manual_seed(0))
-    outputs = ["disparity", "semantic"] if deployed.arch.semantic else ["disparity"]
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         # Tracing warns of its own deprecation, and of sizes that are constants here by intent.
         warnings.simplefilter("ignore")
@@ -150,16 +165,17 @@ def _traced(deployed: Deployed, header: GraphHeader, opset: int) -> onnx.ModelPr
             tuple(pair),
             file,
             input_names=["left", "right"],
-            output_names=outputs,
+            output_names=[*outputs, *inner],
             opset_version=opset,
             dynamo=False,  # the new exporter has no opset 13
         )
         model = _folded(file)
     _rename(model.graph)
+    del model.graph.output[len(outputs) :]  # they keep their names within
     del model.opset_import[:]
     model.opset_import.extend([onnx.helper.make_opsetid("", opset)])
     model.producer_name, model.producer_version = "rts2", header.rts2
-    model.graph.name = header.arch.family
+    model.graph.name = arch.family
     return onnx.shape_inference.infer_shapes(model, strict_mode=True)
 
 

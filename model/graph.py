@@ -15,6 +15,19 @@ from .files import existing_file, parse_json, write_bytes
 HEADER = "rts2"
 """The key of our entry in the file's metadata."""
 
+DISPARITY, SEMANTIC = "disparity", "semantic"
+"""The outputs: what the last stage says, at full resolution."""
+
+
+def answers(stage: int, semantic: bool) -> list[str]:
+    """The values of a graph that hold what stage 1, 2 … says before it is enlarged.
+
+    The best disparity, (1, 1, h, w) in pixels of the full resolution, and with a semantic branch
+    the class scores, (1, classes, h, w). They lie on the way to the last stage's answer: a graph
+    that is cut behind them stops early.
+    """
+    return [f"stage{stage}.disparity", *([f"stage{stage}.scores"] if semantic else ())]
+
 
 class GraphHeader(BaseModel):
     """What an ONNX file of ours says of itself."""
@@ -56,9 +69,14 @@ class GraphHeader(BaseModel):
 
 def save_graph(model: onnx.ModelProto, header: GraphHeader, path: Path) -> None:
     """Writes an ONNX model with our header, whole or not at all."""
+    put_header(model, header)
+    write_bytes(path, model.SerializeToString(deterministic=True))
+
+
+def put_header(model: onnx.ModelProto, header: GraphHeader) -> None:
+    """Lets a model say of itself what `header` says."""
     # What is not set is not written: a file without forms is one that earlier versions read.
     onnx.helper.set_model_props(model, {HEADER: header.model_dump_json(exclude_none=True)})
-    write_bytes(path, model.SerializeToString(deterministic=True))
 
 
 def load_graph(path: Path) -> onnx.ModelProto:
@@ -83,8 +101,14 @@ def read_header(path: Path) -> GraphHeader:
 
 
 def header_of(model: onnx.ModelProto, path: Path) -> GraphHeader:
-    """Our header in the model that was read from `path`."""
-    entry = {entry.key: entry.value for entry in model.metadata_props}.get(HEADER)
-    if entry is None:
+    """Our header in the model that was read from `path`; `Rts2Error` where it has none."""
+    header = found_header(model, path)
+    if header is None:
         raise Rts2Error(f"{path} holds no arch; rts2 reads the ONNX files that rts2 writes")
-    return parse_json(entry, GraphHeader, f"the header of {path}")
+    return header
+
+
+def found_header(model: onnx.ModelProto, path: Path) -> GraphHeader | None:
+    """Our header in the model that was read from `path`; None where another tool wrote it."""
+    entry = {entry.key: entry.value for entry in model.metadata_props}.get(HEADER)
+    return None if entry is None else parse_json(entry, GraphHeader, f"the header of {path}")

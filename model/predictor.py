@@ -19,7 +19,7 @@ from .data.images import Bytes, Disparity
 from .errors import Rts2Error, UsageError
 from .files import existing_file, parse_json
 from .graph import HEADER, GraphHeader
-from .inference import open_session
+from .inference import open_session, serving_options
 from .ops import padded
 
 if TYPE_CHECKING:
@@ -78,13 +78,23 @@ def open_model(path: Path) -> Predictor:
         UsageError: there is no such file.
         Rts2Error: the file is broken, or holds no network that takes a stereo pair.
     """
-    path = existing_file(graph_of(path), "a model (a checkpoint or an ONNX file)")
-    if path.suffix.lower() == ".onnx":
+    path = model_file(path)
+    if is_graph(path):
         return OnnxPredictor(path)
     from .checkpoint import load
 
     network, header = load(path)
     return TorchPredictor(network, header.origin)
+
+
+def model_file(path: Path) -> Path:
+    """The file of a model, which may stand in a bundle; raises as `open_model` does."""
+    return existing_file(graph_of(path), "a model (a checkpoint or an ONNX file)")
+
+
+def is_graph(path: Path) -> bool:
+    """Whether a model's file is an ONNX file, by its name."""
+    return path.suffix.lower() == ".onnx"
 
 
 def prepared(image: Bytes, multiple: int) -> Input:
@@ -96,7 +106,10 @@ def prepared(image: Bytes, multiple: int) -> Input:
     tensor = np.zeros((1, 3, *padded((width, height), multiple)), np.float32)
     scale = np.float32(255) * np.array(STD, np.float32)
     shift = np.array(MEAN, np.float32) / np.array(STD, np.float32)
-    tensor[0, :, :height, :width] = (image / scale - shift).transpose(2, 0, 1)
+    for channel in range(3):  # plane by plane, in place: a seventh of the time
+        plane = tensor[0, channel, :height, :width]
+        np.divide(image[..., channel], scale[channel], out=plane)
+        plane -= shift[channel]
     return tensor
 
 
@@ -144,7 +157,7 @@ class OnnxPredictor:
 
     def __init__(self, path: Path, model: bytes | None = None) -> None:
         self.path = path
-        self.session = open_session(path, model=model)
+        self.session = open_session(path, serving_options(), model)
         self.size = _input_size(self.session, path)
         self.outputs = _outputs(self.session, self.size, path)
         header = _header(self.session, path)
@@ -157,27 +170,47 @@ class OnnxPredictor:
         return cls(path, model.SerializeToString())
 
     def predict(self, left: Bytes, right: Bytes, stages: int | None = None) -> Estimate:
-        stage = None if self.arch is None else self.arch.stages
-        if stages not in (None, stage):
-            runs = "its own number of" if stage is None else str(stage)
+        if stages not in (None, self.stages):
+            runs = "its own number of" if self.stages is None else str(self.stages)
             raise UsageError(
                 f"{self.path} always runs {runs} stages, not {stages}; "
                 "leave --stages out, or give the checkpoint"
             )
-        multiple = MULTIPLE if self.arch is None else self.arch.multiple
+        for image in (left, right):
+            self.require_fits((image.shape[1], image.shape[0]))
         pair = {
-            "left": self._fitted(prepared(left, multiple), left),
-            "right": self._fitted(prepared(right, multiple), right),
+            "left": prepared(left, self.multiple),
+            "right": prepared(right, self.multiple),
         }
         start = perf_counter()
         found = dict(zip(self.outputs, self._answer(pair), strict=True))
         seconds = perf_counter() - start
-        return cut_back(found["disparity"][0], found.get("semantic"), left, seconds, stage)
+        return cut_back(found["disparity"][0], found.get("semantic"), left, seconds, self.stages)
 
     def predict_stages(
         self, left: Bytes, right: Bytes, stages: int | None = None
     ) -> list[Estimate]:
         return [self.predict(left, right, stages)]
+
+    @property
+    def stages(self) -> int | None:
+        """How many stages the graph runs; None where it does not say."""
+        return None if self.arch is None else self.arch.stages
+
+    @property
+    def multiple(self) -> int:
+        """What the sides of images are padded to."""
+        return MULTIPLE if self.arch is None else self.arch.multiple
+
+    def require_fits(self, resolution: tuple[int, int]) -> None:
+        """Raises `UsageError` where images of this width and height pad to another size."""
+        height, width = padded(resolution, self.multiple)
+        if (width, height) != self.size:
+            own = f"{resolution[0]}x{resolution[1]}"
+            raise UsageError(
+                f"{self.path} takes images that pad to {self.size[0]}x{self.size[1]}, and {own} "
+                f"pads to {width}x{height}; export the checkpoint, or open it anew, for {own}"
+            )
 
     def _answer(self, pair: dict[str, Input]) -> list[NDArray[Any]]:
         try:
@@ -185,16 +218,6 @@ class OnnxPredictor:
         except Exception as error:  # ONNX Runtime's errors share no other base
             raise Rts2Error(f"{self.path} fails in ONNX Runtime: {error}") from error
         return found
-
-    def _fitted(self, tensor: Input, image: Bytes) -> Input:
-        height, width = tensor.shape[-2:]
-        if (width, height) != self.size:
-            own = f"{image.shape[1]}x{image.shape[0]}"
-            raise UsageError(
-                f"{self.path} takes images that pad to {self.size[0]}x{self.size[1]}, and {own} "
-                f"pads to {width}x{height}; export the checkpoint for {own}"
-            )
-        return tensor
 
 
 def enlarged(stage: Stage, size: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:
