@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from . import evaluation
 from .box import DEFAULT, SHIPPED, named_model
-from .cloud import Calibration, cloud, read_calibration, write_cloud
+from .cloud import Calibration, read_calibration
 from .console import (
     add_output,
     command,
@@ -25,30 +21,24 @@ from .console import (
     resolution,
     screen,
     seed,
+    whole_between,
 )
 from .data.catalog import DATASETS, STREETS, open_dataset, require_generated
-from .data.images import (
-    LARGEST_PX,
-    image_size,
-    read_rgb,
-    require_same_size,
-    storable,
-    write_disparity,
-    write_image,
-    write_indexed,
-)
-from .data.layout import IMAGES, images_of
+from .data.images import read_rgb
 from .data.scene import Sample, fingerprint, require_crop_fits
 from .errors import UsageError
 from .files import output_folder
-from .pictures import PALETTE, coloured, legend, overlay
+from .pairs import Pair, pairs_of
+from .results import Results
 from .submission import Part, finish, new_folder, write_frame
+from .video import VIDEOS, Stream, is_video
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from .data.images import Bytes
     from .predictor import Estimate, Predictor
+    from .session import Sessions, StereoSession
 
 MODEL = (
     f"{', '.join(SHIPPED)} in the box, a checkpoint (rts2's .safetensors, AnyNet's released .tar), "
@@ -81,62 +71,88 @@ TITLES = {
 }
 """The columns of rts2-eval's table, by figure."""
 
-LEGEND = "classes.png"
-"""Which colour of a picture is which class, once for all pairs of a folder."""
-
 SHOWN_IMAGES = 20
 """With more images than this the table has the totals alone."""
 
 SUBMITTED = "kitti2015"
 """The data set whose servers take a submission."""
 
-SMALLEST_PX = 32
-"""Below this an image has no feature at 1/32."""
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two image files of one size."""
-
-    name: str
-    left: Path
-    right: Path
-    size: tuple[int, int]
-
 
 @command
 def infer(arguments: Sequence[str] | None = None) -> int:
-    """The command rts2-infer: disparity, semantics and points of pairs or folders of pairs."""
+    """The command rts2-infer: disparity, semantics and points of pairs, videos and cameras."""
     options = _infer_parser().parse_args(arguments)
     calibration = _calibration(options)
-    pairs = _pairs(options.left, options.right)
+    stream = _stream(options)
+    if stream is not None:
+        _infer_stream(options, stream, calibration)
+    else:
+        _infer_pairs(options, calibration)
+    return 0
+
+
+def _infer_pairs(options: argparse.Namespace, calibration: Calibration | None) -> None:
+    """Two images, or two folders of them."""
+    pairs = pairs_of(options.left, options.right)
     if calibration is not None:
         for pair in pairs:
             calibration.require_fits(pair.size)
-    predictor = _open(options.model)
-    _warm(predictor, pairs, options.stages)
-    folder = output_folder(options.out)
-    results, legend_file = [], None
+    sessions = _sessions(options)
+    for pair in {pair.size: pair for pair in reversed(pairs)}.values():
+        # What does not fit shows before anything is written or timed.
+        session, _, _ = _answered(sessions, pair, options.budget_ms)
+    results = Results(output_folder(options.out), calibration, options.max_disparity)
+    rows, legend = [], None
     for pair in progress(pairs, "pairs", len(pairs)):
-        left, right = read_rgb(pair.left), read_rgb(pair.right)
-        estimate = predictor.predict(left, right, options.stages)
-        files = _write(folder, pair.name, left, estimate, calibration, options.max_disparity)
-        results.append(_summary(pair, estimate, files))
-        if estimate.semantic is not None and legend_file is None:
-            legend_file = LEGEND
-            write_image(folder / LEGEND, legend())
+        _, left, estimate = _answered(sessions, pair, options.budget_ms)
+        rows.append(results.write(pair.name, left, estimate))
+        if estimate.semantic is not None and legend is None:
+            legend = results.write_legend()
+    report = {**_about(options.model, session), "legend": legend, "pairs": rows, "stream": None}
     if options.json:
-        print_json(
-            {
-                "schema": "rts2.infer/1",
-                **_about(options.model, predictor),
-                "legend": legend_file,
-                "pairs": results,
-            }
-        )
+        print_json({"schema": "rts2.infer/1", **report})
     else:
-        _show_pairs(results, legend_file, _title(options.model, predictor), folder)
-    return 0
+        _show_pairs(report, _title(options.model, session), options.out)
+
+
+def _answered(
+    sessions: Sessions, pair: Pair, budget_ms: float | None
+) -> tuple[StereoSession, Bytes, Estimate]:
+    """A pair's session, its left image and what the network says of it."""
+    session = sessions.of(pair.size)
+    left, right = read_rgb(pair.left), read_rgb(pair.right)
+    return session, left, session.predict(left, right, budget_ms=budget_ms)
+
+
+def _infer_stream(
+    options: argparse.Namespace, stream: Stream, calibration: Calibration | None
+) -> None:
+    """Videos or cameras."""
+    from .watch import Watch
+
+    if calibration is not None:
+        if not options.frames:
+            raise UsageError("the points of a video are those of its frames; add --frames")
+        calibration.require_fits(stream.size)
+    session = _sessions(options).of(stream.size)
+    results = Results(options.out, calibration, options.max_disparity)
+    summary = Watch(stream, session, results, options.budget_ms, options.frames).run(options.limit)
+    legend = results.write_legend() if len(summary.files) > 1 else None
+    told = {
+        "name": stream.name,
+        "size": stream.size,
+        "frames": summary.frames,
+        "fps": summary.fps,
+        "network_ms": summary.median_ms,
+        "stages": [{"stage": k, "frames": n} for k, n in sorted(summary.stages.items())],
+        "files": summary.files,
+    }
+    about = _about(options.model, session)
+    report = {**about, "legend": legend, "pairs": summary.rows, "stream": told}
+    if options.json:
+        print_json({"schema": "rts2.infer/1", **report})
+    else:
+        _show_stream(report, _title(options.model, session), options.out)
 
 
 @command
@@ -216,30 +232,32 @@ def _submission_folder(options: argparse.Namespace) -> Path:
 def _infer_parser() -> argparse.ArgumentParser:
     command = parser(
         "rts2-infer",
-        "Disparity, semantics and metric points of stereo pairs. LEFT and RIGHT are two rectified "
-        "images, or two folders of equally named ones.",
+        "Disparity, semantics and metric points of stereo pairs, videos and cameras. LEFT and "
+        "RIGHT are two rectified images, two folders of equally named ones, or two videos; LEFT "
+        "alone is a video that holds both images side by side.",
         "rts2-infer left.png right.png --focal 721.5 --baseline 0.54",
     )
-    command.add_argument("left", type=Path, metavar="LEFT")
-    command.add_argument("right", type=Path, metavar="RIGHT")
+    add = command.add_argument
+    add("left", type=Path, nargs="?", metavar="LEFT")
+    add("right", type=Path, nargs="?", metavar="RIGHT")
+    text = "a camera with both images side by side, or two cameras, left and right"
+    add("--camera", type=_camera, nargs="+", metavar="INDEX", help=text)
+    add("--camera-size", type=resolution, metavar="WxH", help="what a camera is asked for")
     text = f"{MODEL} (default: {DEFAULT})"
-    command.add_argument("--model", type=named_model, default=DEFAULT, metavar="MODEL", help=text)
-    command.add_argument("--stages", type=int, metavar="K", help="stop after this many stages")
-    command.add_argument(
-        "--focal", type=positive, metavar="PX", help="focal length in pixels, for a point cloud"
-    )
-    command.add_argument(
-        "--baseline", type=positive, metavar="M", help="distance of the cameras in metres"
-    )
-    command.add_argument(
-        "--calib", type=Path, metavar="FILE", help="Middlebury's calib.txt or a KITTI calibration"
-    )
-    command.add_argument(
-        "--max-disparity",
-        type=positive,
-        metavar="PX",
-        help="where the colours end (default: each map's 98th percentile)",
-    )
+    add("--model", type=named_model, default=DEFAULT, metavar="MODEL", help=text)
+    add("--stages", type=int, metavar="K", help="stop after this many stages")
+    text = "run as many stages as fit into this time for a pair"
+    add("--budget-ms", type=positive, metavar="MS", help=text)
+    add("--focal", type=positive, metavar="PX", help="focal length in pixels, for a point cloud")
+    add("--baseline", type=positive, metavar="M", help="distance of the cameras in metres")
+    text = "Middlebury's calib.txt or a KITTI calibration"
+    add("--calib", type=Path, metavar="FILE", help=text)
+    text = "where the colours end (default: the 98th percentile)"
+    add("--max-disparity", type=positive, metavar="PX", help=text)
+    text = "of videos and cameras also write the files of every pair"
+    add("--frames", action="store_true", help=text)
+    text = "of videos and cameras take the first N pairs"
+    add("--limit", type=_count, metavar="N", help=text)
     add_output(command)
     return command
 
@@ -287,96 +305,54 @@ def _calibration(options: argparse.Namespace) -> Calibration | None:
     return Calibration(*loose)
 
 
-def _pairs(left: Path, right: Path) -> list[Pair]:
-    """The pairs that two images or two folders make, each of one size."""
-    if left.is_dir() != right.is_dir():
-        folder, other = (left, right) if left.is_dir() else (right, left)
+def _stream(options: argparse.Namespace) -> Stream | None:
+    """The videos or cameras that the options name; None for images."""
+    given = [path for path in (options.left, options.right) if path is not None]
+    if options.camera is not None:
+        if given or len(options.camera) > 2:
+            raise UsageError("--camera takes one index or two, and no LEFT and RIGHT beside it")
+        return Stream(options.camera, options.camera_size)
+    if not given:
+        raise UsageError("give LEFT and RIGHT, a video of both, or --camera (see --help)")
+    _require_alike(given, options)
+    return Stream(given) if is_video(given[0]) else None
+
+
+def _require_alike(given: list[Path], options: argparse.Namespace) -> None:
+    """Raises `UsageError` for a video beside an image, and options that are for one of them."""
+    videos = [path for path in given if is_video(path)]
+    if options.camera_size is not None:
+        raise UsageError("--camera-size is for --camera")
+    if videos:
+        if len(videos) < len(given):
+            raise UsageError(f"LEFT and RIGHT must be of one kind: {videos[0]} alone is a video")
+        return
+    if len(given) == 1:
         raise UsageError(
-            f"LEFT and RIGHT must be two images or two folders: {folder} is a folder, "
-            f"{other} is not"
+            f"RIGHT is missing: LEFT alone must be a video ({', '.join(VIDEOS)}), not {given[0]}"
         )
-    names = [(left, right)] if not left.is_dir() else _partners(left, right)
-    return [_pair(a, b) for a, b in names]
+    if options.frames or options.limit is not None:
+        raise UsageError("--frames and --limit are for videos and cameras")
 
 
-def _pair(left: Path, right: Path) -> Pair:
-    size = require_same_size({left: image_size(left), right: image_size(right)})
-    if min(size) < SMALLEST_PX:
-        given = "{}x{}".format(*size)
-        raise UsageError(f"images need sides of {SMALLEST_PX} pixels or more: {left} is {given}")
-    return Pair(left.stem, left, right, size)
+def _sessions(options: argparse.Namespace) -> Sessions:
+    from .session import Sessions
+
+    return Sessions(options.model, options.stages, early=options.budget_ms is not None)
 
 
-def _partners(left: Path, right: Path) -> list[tuple[Path, Path]]:
-    """The equally named images of two folders; one without partner is an error."""
-    found = [images_of(folder) for folder in (left, right)]
-    for folder, images, others in ((right, found[1], found[0]), (left, found[0], found[1])):
-        lacking = sorted(others.keys() - images.keys())
-        if lacking:
-            raise UsageError(
-                f"every image needs a partner of its name: {folder} has no {lacking[0]} "
-                f"({len(others)} images against {len(images)})"
-            )
-    if not found[0]:
-        raise UsageError(f"a folder must hold images ({', '.join(IMAGES)}); {left} holds none")
-    return [(found[0][stem], found[1][stem]) for stem in sorted(found[0])]
+def _camera(text: str) -> int:
+    return whole_between(text, 0, 99)
 
 
-def _warm(predictor: Predictor, pairs: list[Pair], stages: int | None) -> None:
-    """Runs one pair of each size: what does not fit shows before anything is written or timed."""
-    for pair in {pair.size: pair for pair in reversed(pairs)}.values():
-        predictor.predict(read_rgb(pair.left), read_rgb(pair.right), stages)
+def _count(text: str) -> int:
+    return whole_between(text, 1, 10**9)
 
 
-def _write(
-    folder: Path,
-    name: str,
-    image: Bytes,
-    estimate: Estimate,
-    calibration: Calibration | None,
-    highest_px: float | None,
-) -> list[str]:
-    """Writes everything that one estimate gives; returns the names of the files."""
-    files: list[Path] = []
-
-    def named(what: str) -> Path:
-        files.append(folder / f"{name}_{what}")
-        return files[-1]
-
-    saturated = write_disparity(named("disparity.png"), estimate.disparity)
-    if saturated:
-        note = "%s: %d pixels exceed %.3f px, the most that the format holds"
-        logging.getLogger(__name__).warning(note, files[0], saturated, LARGEST_PX)
-    write_image(named("color.png"), coloured(estimate.disparity, highest_px))
-    if estimate.semantic is not None:
-        write_indexed(named("semantic.png"), estimate.semantic, PALETTE)
-        write_image(named("overlay.png"), overlay(image, estimate.semantic))
-    if calibration is not None:
-        write_cloud(named("cloud.ply"), cloud(estimate.disparity, image, calibration))
-    return [path.name for path in files]
-
-
-def _summary(pair: Pair, estimate: Estimate, files: list[str]) -> dict[str, Any]:
-    """One pair's line of the report; its range is that of the file, none without a known pixel.
-
-    A network's residuals may lead below 0, where no disparity lies and no file holds one.
-    """
-    known = storable(estimate.disparity)
-    known = known[np.isfinite(known)]
-    return {
-        "name": pair.name,
-        "size": pair.size,
-        "stage": estimate.stage,
-        "disparity_px": [float(known.min()), float(known.max())] if known.size else None,
-        "network_ms": 1000 * estimate.seconds,
-        "files": files,
-    }
-
-
-def _about(path: Path, predictor: Predictor) -> dict[str, Any]:
+def _about(path: Path, network: Predictor | StereoSession) -> dict[str, Any]:
     """What a report says of its model."""
-    arch = None if predictor.arch is None else predictor.arch.model_dump(mode="json")
-    return {"model": str(path), "arch": arch, "origin": predictor.origin}
+    arch = None if network.arch is None else network.arch.model_dump(mode="json")
+    return {"model": str(path), "arch": arch, "origin": network.origin}
 
 
 def _submitted(folder: Path, parts: Sequence[Part]) -> dict[str, Any]:
@@ -384,24 +360,46 @@ def _submitted(folder: Path, parts: Sequence[Part]) -> dict[str, Any]:
     return {"folder": str(folder), "parts": [part.to_json() for part in parts]}
 
 
-def _show_pairs(
-    results: list[dict[str, Any]], legend_file: str | None, title: str, folder: Path
-) -> None:
+def _show_pairs(report: dict[str, Any], title: str, folder: Path) -> None:
     table = _table("pair", "size", "disparity px", "network ms", "files")
-    for result in results:
-        low, high = result["disparity_px"] or (None, None)
+    for row in report["pairs"]:
+        low, high = row["disparity_px"] or (None, None)
         table.add_row(
-            result["name"],
-            "{}x{}".format(*result["size"]),
+            row["name"],
+            "{}x{}".format(*row["size"]),
             f"{figure(low, 1)} – {figure(high, 1)}",
-            figure(result["network_ms"], 0),
-            " ".join(name.removeprefix(f"{result['name']}_") for name in result["files"]),
+            figure(row["network_ms"], 0),
+            " ".join(name.removeprefix(f"{row['name']}_") for name in row["files"]),
         )
+    note = "network ms: one run each, the first of each size after a warm-up"
+    written = f"{folder}/  NAME_…  {report['legend'] or ''}".rstrip()
+    _show(title, table, note, f"written   {written}")
+
+
+def _show_stream(report: dict[str, Any], title: str, folder: Path) -> None:
+    told = report["stream"]
+    table = _table("stream", "size", "pairs", "FPS", "network ms", "stages: pairs")
+    stages = (f"{figure(each['stage'], 0)}: {each['frames']}" for each in told["stages"])
+    table.add_row(
+        told["name"],
+        "{}x{}".format(*told["size"]),
+        str(told["frames"]),
+        figure(told["fps"], 1),
+        figure(told["network_ms"], 0),
+        "  ".join(stages),
+    )
+    note = "FPS: with reading, colours and writing; network ms: the median"
+    each = f"{told['name']}_000000_…" if report["pairs"] else ""
+    files = "  ".join(filter(None, (*told["files"], each, report["legend"])))
+    _show(title, table, note, f"written   {folder}/  {files}")
+
+
+def _show(title: str, table: Table, *notes: str) -> None:
     console = screen()
     console.print(title)
     console.print(table)
-    console.print("network ms: one run each, the first of each size after a warm-up")
-    console.print(f"written   {folder}/  NAME_…  {legend_file or ''}".rstrip(), soft_wrap=True)
+    for note in notes:
+        console.print(note, soft_wrap=True)
 
 
 def _show_scores(report: dict[str, Any], title: str, parts: Sequence[Part]) -> None:
@@ -456,8 +454,8 @@ def _table(*columns: str) -> Table:
     return table
 
 
-def _title(model: Path, predictor: Predictor) -> str:
+def _title(model: Path, network: Predictor | StereoSession) -> str:
     """The file, its network, and how its weights came to be."""
-    label = "an ONNX graph" if predictor.arch is None else predictor.arch.label()
+    label = "an ONNX graph" if network.arch is None else network.arch.label()
     named = f"{model.name} · {label}"
-    return named if predictor.origin is None else f"{named} · {predictor.origin}"
+    return named if network.origin is None else f"{named} · {network.origin}"

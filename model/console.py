@@ -122,14 +122,23 @@ def figure(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def progress(items: Iterable[Item], title: str, total: int) -> Iterator[Item]:
-    """`items`, with a progress bar on stderr where stderr is a terminal."""
-    from rich.console import Console
-    from rich.progress import track
+def progress(
+    items: Iterable[Item], title: str | Callable[[], str], total: int | None
+) -> Iterator[Item]:
+    """`items`, with a progress bar on stderr where stderr is a terminal.
 
+    A title that can change is asked for after every item; without a `total` the bar only moves.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    told = title if callable(title) else lambda: title
     console = Console(stderr=True)
-    disabled = not console.is_terminal
-    return iter(track(items, title, total=total, console=console, disable=disabled))
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(told(), total=total)
+        for item in items:
+            yield item
+            bars.update(bar, advance=1, description=told())
 
 
 def screen() -> Console:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -11,6 +12,11 @@ from .data.labels import CLASS_NAMES
 
 BRIGHTEST: Final = 98
 """The percentile of a disparity map that its colours end at, unless a maximum is given."""
+
+COLOURS: Final = 256
+
+CAPTION_LINES: Final = 20
+"""How many lines of captions a picture has room for."""
 
 PALETTE: Bytes = np.array(
     [
@@ -44,15 +50,20 @@ def coloured(disparity: Disparity, highest_px: float | None = None) -> Bytes:
 
     Without `highest_px` the scale ends at the map's 98th percentile.
     """
-    from matplotlib import colormaps
-
     known = np.isfinite(disparity)
     if highest_px is None:
-        highest_px = float(np.percentile(disparity[known], BRIGHTEST)) if known.any() else 1.0
+        highest_px = brightest_px(disparity)
     share = np.where(known, disparity, 0) / max(highest_px, 1e-6)
-    colours = colormaps["turbo"](share.clip(0, 1), bytes=True)[..., :3]
-    painted: Bytes = np.where(known[..., None], colours, 0).astype(np.uint8)
-    return painted
+    steps = (share.clip(0, 1) * COLOURS).clip(0, COLOURS - 1).astype(np.uint8)
+    coloured: Bytes = _turbo()[steps]
+    coloured[~known] = 0
+    return coloured
+
+
+def brightest_px(disparity: Disparity) -> float:
+    """Where the colours of a map end: its 98th percentile; 1 where nothing is known."""
+    known = disparity[np.isfinite(disparity)]
+    return float(np.percentile(known, BRIGHTEST)) if known.size else 1.0
 
 
 def painted(semantic: Bytes) -> Bytes:
@@ -62,11 +73,24 @@ def painted(semantic: Bytes) -> Bytes:
 
 def overlay(image: Bytes, semantic: Bytes, share: float = 0.5) -> Bytes:
     """The image (H, W, 3) with its classes' colours laid over it; `share` of 1 hides the image."""
-    classes = painted(semantic).astype(np.float32)
-    mixed = np.where(
-        (semantic < len(PALETTE))[..., None], image * (1 - share) + classes * share, image
-    )
-    return np.rint(mixed).astype(np.uint8)
+    import cv2
+
+    mixed = cv2.addWeighted(image, 1 - share, painted(semantic), share, 0)
+    unknown = semantic >= len(PALETTE)
+    mixed[unknown] = image[unknown]
+    return np.asarray(mixed, np.uint8)
+
+
+def captioned(picture: Bytes, text: str) -> Bytes:
+    """The picture (H, W, 3) with a line of white text, edged in black, at its top left."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    size = max(picture.shape[0] // CAPTION_LINES, 10)
+    strip = Image.fromarray(picture[: 2 * size])
+    draw, font = ImageDraw.Draw(strip), ImageFont.load_default(size)
+    edge = max(size // 10, 1)
+    draw.text((size / 2, size / 3), text, "white", font, stroke_width=edge, stroke_fill="black")
+    return np.concatenate([np.asarray(strip), picture[2 * size :]])
 
 
 def legend() -> Bytes:
@@ -81,6 +105,14 @@ def legend() -> Bytes:
         draw.rectangle((x, y, x + 40, y + height - 6), fill=tuple(PALETTE[train_id].tolist()))
         draw.text((x + 50, y + (height - 6) / 2), name, "black", font, anchor="lm")
     return np.asarray(picture)
+
+
+@cache
+def _turbo() -> Bytes:
+    """The colours of disparities, (256, 3)."""
+    from matplotlib import colormaps
+
+    return colormaps["turbo"](np.arange(COLOURS), bytes=True)[:, :3]
 
 
 def _full_palette() -> Bytes:

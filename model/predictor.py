@@ -202,11 +202,15 @@ class OnnxPredictor:
         """What the sides of images are padded to."""
         return MULTIPLE if self.arch is None else self.arch.multiple
 
+    def fits(self, resolution: tuple[int, int]) -> bool:
+        """Whether images of this width and height pad to the size of the graph."""
+        return padded(resolution, self.multiple) == self.size[::-1]
+
     def require_fits(self, resolution: tuple[int, int]) -> None:
-        """Raises `UsageError` where images of this width and height pad to another size."""
-        height, width = padded(resolution, self.multiple)
-        if (width, height) != self.size:
-            own = f"{resolution[0]}x{resolution[1]}"
+        """Raises `UsageError` for images of a width and height that do not fit."""
+        if not self.fits(resolution):
+            own = "{}x{}".format(*resolution)
+            height, width = padded(resolution, self.multiple)
             raise UsageError(
                 f"{self.path} takes images that pad to {self.size[0]}x{self.size[1]}, and {own} "
                 f"pads to {width}x{height}; export the checkpoint, or open it anew, for {own}"

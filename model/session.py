@@ -37,6 +37,9 @@ TIMED: Final = 2
 REMEMBERED: Final = 20
 """Calls whose times tell what the next one will take."""
 
+OPEN: Final = 2
+"""Sessions that are open at a time, where images differ in size."""
+
 EXPECTED: Final = 90
 """The percentile of these times that must fit into a budget."""
 
@@ -81,6 +84,10 @@ class StereoSession:
     def size(self) -> tuple[int, int]:
         """(width, height) that images are padded to; those that pad to another are refused."""
         return self._predictors[-1].size
+
+    def fits(self, resolution: tuple[int, int]) -> bool:
+        """Whether images of this width and height pad to `size`."""
+        return self._predictors[-1].fits(resolution)
 
     @property
     def expected_ms(self) -> dict[int | None, float]:
@@ -144,6 +151,30 @@ class StereoSession:
             predictor.predict(blank, blank)
             for _ in range(TIMED):
                 self.predict(blank, blank, predictor.stages)
+
+
+class Sessions:
+    """The sessions of one model for images of any size, opened as they are asked for.
+
+    The arguments are those of `StereoSession`. The last `OPEN` stay open.
+    """
+
+    def __init__(self, model: str | Path, stages: int | None = None, early: bool = True) -> None:
+        self._arguments = (stages, early)
+        self._model = model
+        self._open: list[StereoSession] = []
+
+    def of(self, resolution: tuple[int, int]) -> StereoSession:
+        """The session for images of this width and height; raises as `StereoSession` does."""
+        for session in self._open:
+            if session.fits(resolution):
+                self._open.remove(session)
+                break
+        else:
+            del self._open[: 1 - OPEN]
+            session = StereoSession(self._model, resolution, *self._arguments)
+        self._open.append(session)
+        return session
 
 
 class Times:

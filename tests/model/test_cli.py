@@ -190,19 +190,33 @@ def test_table_tells_what_was_written(
         assert words in printed.out
 
 
+class Given:
+    """A session that stands in for one of a network, and takes a quarter of a second."""
+
+    arch = origin = None
+
+    def fits(self, size: tuple[int, int]) -> bool:
+        return True
+
+    def predict(self, left: np.ndarray, right: np.ndarray, budget_ms: float | None) -> Estimate:
+        return Estimate(self.estimate(left), None, 0.25, None)
+
+    def estimate(self, left: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+
 def test_network_is_warmed_up_and_timed_in_milliseconds(
     home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Slow:
-        arch = origin = None
+    class Slow(Given):
         runs = 0
 
-        def predict(self, left: np.ndarray, *rest: object) -> Estimate:
+        def estimate(self, left: np.ndarray) -> np.ndarray:
             self.runs += 1
-            return Estimate(left[..., 0].astype(np.float32), None, 0.25, None)
+            return left[..., 0].astype(np.float32)
 
     slow = Slow()
-    monkeypatch.setattr("rts2.model.predictor.open_model", lambda path: slow)
+    monkeypatch.setattr("rts2.model.session.StereoSession", lambda *_: slow)
     folders = [str(home / "left"), str(home / "right")]
     told = report(infer, [*folders, "--model", "m.onnx", "--out", str(home / "out")], capsys)
     assert [pair["network_ms"] for pair in told["pairs"]] == [250.0, 250.0]
@@ -224,14 +238,11 @@ def test_the_range_is_that_of_the_written_file(
     values: list[float],
     wanted: list[float] | None,
 ) -> None:
-    class Given:
-        arch = origin = None
+    class Known(Given):
+        def estimate(self, left: np.ndarray) -> np.ndarray:
+            return np.resize(np.array(values, np.float32), left.shape[:2])
 
-        def predict(self, left: np.ndarray, *rest: object) -> Estimate:
-            rows = np.resize(np.array(values, np.float32), left.shape[:2])
-            return Estimate(rows, None, 0.25, None)
-
-    monkeypatch.setattr("rts2.model.predictor.open_model", lambda path: Given())
+    monkeypatch.setattr("rts2.model.session.StereoSession", lambda *_: Known())
     arguments = infer_arguments(home, Path("m.onnx"))
     assert infer([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["pairs"][0]["disparity_px"] == wanted
