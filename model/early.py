@@ -50,13 +50,15 @@ def stopped(model: onnx.ModelProto, header: GraphHeader, stage: int) -> onnx.Mod
 
 
 def _before(nodes: Sequence[onnx.NodeProto], values: Iterable[str]) -> list[onnx.NodeProto]:
-    """The nodes that these values rest on, in their order: every one stands behind its makers."""
-    wanted, found = set(values), []
-    for node in reversed(nodes):
-        if wanted.intersection(node.output):
-            wanted.update(node.input)
-            found.append(node)
-    return found[::-1]
+    """The nodes that these values rest on, in the order of the graph."""
+    maker = {value: index for index, node in enumerate(nodes) for value in node.output}
+    open_values, found = list(values), set()
+    while open_values:
+        index = maker.get(open_values.pop())
+        if index is not None and index not in found:
+            found.add(index)
+            open_values.extend(nodes[index].input)
+    return [nodes[index] for index in sorted(found)]
 
 
 def _enlarged(name: str, size: Sequence[int]) -> list[onnx.NodeProto]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from .errors import Rts2Error
 from .files import output_folder, write_bytes
-from .graph import load_graph
+from .graph import header_of, load_graph
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -41,6 +41,7 @@ def exported(checkpoint: Path, resolution: tuple[int, int]) -> ModelProto:
     kept = folder() / f"{_name(checkpoint, resolution)}.onnx"
     with suppress(Rts2Error, OSError):
         model = load_graph(kept)
+        header_of(model, kept)
         kept.touch()
         return model
     content = _export(checkpoint, resolution)

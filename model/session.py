@@ -233,7 +233,7 @@ def _cuts(
 
 
 def _cannot_stop(path: Path, known: Any, stages: int) -> UsageError:
-    can = " or ".join("as many as it has" if k is None else str(k) for k in known)
+    can = " or ".join("its own number of" if k is None else str(k) for k in known)
     return UsageError(
         f"{path} runs {can} stages here, not {stages}; leave the stages out, or give the checkpoint"
     )
