@@ -39,6 +39,9 @@ FASTEST_FPS: Final = 1000.0
 RECENT: Final = 30
 """Frames whose rate is shown."""
 
+QUIET: Final = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_PRIORITY_CV_MJPEG": "0"}
+"""FFmpeg says nothing, and what reads a broken .avi after it, and cannot be silenced, does not."""
+
 LEAVING: Final = frozenset((27, ord("q")))
 """Keys that end a view: Escape and q."""
 
@@ -85,8 +88,8 @@ class Stream:
         (width, height), title = self._reels[0].size, self._reels[0].title
         if width % 2:
             raise UsageError(
-                f"one video must hold both images side by side, of equal width: {title} is {width} "
-                "pixels wide; give LEFT and RIGHT where each has its own"
+                f"one source must hold both images side by side, of equal width: {title} is "
+                f"{width} pixels wide; give LEFT and RIGHT where each has its own"
             )
         return width // 2, height
 
@@ -122,8 +125,8 @@ class _Reel:
         self.size: tuple[int, int] = (first.shape[1], first.shape[0])
         told = self._video.get(cv2.CAP_PROP_FPS)
         self.fps: float = told if 0 < told < FASTEST_FPS else USUAL_FPS
-        count = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.count: int | None = count if count > 0 else None
+        count = self._video.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.count: int | None = int(count) if count > 0 else None
 
     def grab(self) -> bool:
         """Goes on to the next frame; False behind the last."""
@@ -208,8 +211,9 @@ class Rate:
 
 @cache
 def _opencv() -> Any:
-    """OpenCV, silent; FFmpeg reads how much it should say when it is first used."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    """OpenCV, silent: it asks the environment when it is first used."""
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
     import cv2
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

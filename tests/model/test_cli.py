@@ -4,7 +4,7 @@ import json
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from rts2.model.cli import evaluate, infer
 from rts2.model.data.images import read_disparity, read_rgb, read_whole
 from rts2.model.pictures import legend
 from rts2.model.predictor import Estimate, open_model
+from rts2.model.video import Stream, film
 
 Command = Callable[[list[str]], int]
 
@@ -36,6 +37,18 @@ def put(path: Path, pixels: np.ndarray) -> Path:
 def noise(seed: int, height: int = 64, width: int = 96) -> np.ndarray:
     generator = np.random.default_rng(seed)
     return generator.integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+PAIRS = [(noise(seed), noise(seed + 10)) for seed in range(3)]
+
+
+def filmed(path: Path, pairs: Sequence[tuple[np.ndarray, ...]]) -> Path:
+    """A video of images side by side."""
+    frames = [np.concatenate(pair, axis=1) for pair in pairs]
+    with film(path, frames[0].shape[1::-1], 8.0) as write:
+        for frame in frames:
+            write(frame)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -351,6 +364,8 @@ def wrong(home: Path, models: Path) -> dict[str, tuple[list[str], int, str]]:
     (home / "half.png").write_bytes((home / "left" / "0.png").read_bytes()[:5000])
     (home / "file").write_text("in the way")
     (home / "calib.txt").write_text(CALIBRATION.replace("96", "97"))
+    (home / "broken.mp4").write_text("hello")
+    video, film = str(home / "broken.mp4"), str(filmed(home / "both.mp4", PAIRS))
     rest = good[2:]
     folder = str(home / "left")
     return {
@@ -383,6 +398,38 @@ def wrong(home: Path, models: Path) -> dict[str, tuple[list[str], int, str]]:
             "it is for 97x64, they are 96x64",
         ),
         "missing calibration": ([*good, "--calib", "none"], 2, "a calibration must be a file"),
+        "small budget": ([*good, "--budget-ms", "0.001"], 2, "a budget must hold the first stage"),
+        "budget 0": ([*good, "--budget-ms", "0"], 2, "finite number above 0"),
+        "nothing": (rest, 2, "give LEFT and RIGHT, a video of both, or --camera"),
+        "left alone": ([left, *rest], 2, "RIGHT is missing: LEFT alone must be a video"),
+        "video and image": ([video, right, *rest], 2, "must be of one kind: "),
+        "image and video": ([left, video, *rest], 2, "must be of one kind: "),
+        "missing video": (["n.mp4", *rest], 2, "a video must be a file: n.mp4"),
+        "broken video": ([video, *rest], 1, "broken.mp4 gives no frame"),
+        "frames of images": ([*good, "--frames"], 2, "for videos and cameras"),
+        "limit of images": ([*good, "--limit", "3"], 2, "for videos and cameras"),
+        "limit 0": ([film, *rest, "--limit", "0"], 2, "a whole number from 1 to"),
+        "size of images": ([*good, "--camera-size", "64x64"], 2, "--camera-size is for --camera"),
+        "camera and images": ([*good, "--camera", "0"], 2, "no LEFT and RIGHT beside it"),
+        "three cameras": ([*rest, "--camera", "0", "1", "2"], 2, "takes one index or two"),
+        "camera -1": ([*rest, "--camera", "-1"], 2, "--camera"),
+        "no camera": (["--camera", "77", *rest], 1, "camera 77 gives no frame"),
+        "points of a film": (
+            [film, *rest, "--focal", "7", "--baseline", "1"],
+            2,
+            "add --frames",
+        ),
+        "other calibration of a film": (
+            [film, *rest, "--frames", "--calib", str(home / "calib.txt")],
+            2,
+            "it is for 97x64, they are 96x64",
+        ),
+        "stages 4 of a film": ([film, *rest, "--stages", "4"], 2, "stages must be 1 to 3"),
+        "small budget of a film": (
+            [film, *rest, "--budget-ms", "0.001"],
+            2,
+            "a budget must hold the first stage",
+        ),
     }
 
 
@@ -408,6 +455,26 @@ WRONG = [
     "two cameras",
     "other calibration",
     "missing calibration",
+    "small budget",
+    "budget 0",
+    "nothing",
+    "left alone",
+    "video and image",
+    "image and video",
+    "missing video",
+    "broken video",
+    "frames of images",
+    "limit of images",
+    "limit 0",
+    "size of images",
+    "camera and images",
+    "three cameras",
+    "camera -1",
+    "no camera",
+    "points of a film",
+    "other calibration of a film",
+    "stages 4 of a film",
+    "small budget of a film",
 ]
 
 
@@ -447,6 +514,151 @@ def test_broken_image_in_a_folder_keeps_what_was_done(
     assert code == 1
     assert str(image) in line
     assert [path.name for path in left_behind(home)] == ["0_color.png", "0_disparity.png"]
+
+
+def test_a_budget_is_kept_in_fewer_stages(
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    planted = {1: 10.0, 2: 20.0, 3: 40.0}
+    stages = iter(planted.values())
+
+    class Planted:
+        """Calls that take as long as was planted, whatever they took."""
+
+        def __init__(self) -> None:
+            self.expected_ms = next(stages)
+
+        def add(self, ms: float) -> None: ...
+
+        def forget_slowest(self) -> None: ...
+
+    monkeypatch.setattr("rts2.model.session.Times", Planted)
+    arguments = infer_arguments(home, models / "full.safetensors", "--budget-ms", "30")
+    (pair,) = report(infer, arguments, capsys)["pairs"]
+    assert pair["stage"] == 2
+    left, right = (read_rgb(home / side / "0.png") for side in ("left", "right"))
+    wanted = open_model(models / "full.safetensors").predict(left, right, 2)
+    written = read_disparity(home / "out" / "0_disparity.png")
+    np.testing.assert_allclose(written, wanted.disparity, atol=0.5 / 256 + 1e-3)
+
+
+def test_a_graph_stops_early_too(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rts2.model.checkpoint import load
+    from rts2.model.export import export
+
+    network = load(models / "full.safetensors")[0]
+    export(network, home / "a.onnx", (96, 64), "a test")
+    told = report(infer, infer_arguments(home, home / "a.onnx", "--stages", "1"), capsys)
+    assert [pair["stage"] for pair in told["pairs"]] == [1]
+    assert told["arch"]["stages"] == 3, "that of the network"
+
+
+def test_images_of_several_sizes(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("left", "right"):
+        for index, size in ((2, (70, 90)), (3, (120, 40)), (4, (64, 96))):
+            put(home / side / f"{index}.png", noise(index, *size))
+    folders = [str(home / "left"), str(home / "right"), "--out", str(home / "out")]
+    told = report(infer, [*folders, "--model", str(models / "full.safetensors")], capsys)
+    sizes = [[96, 64], [96, 64], [90, 70], [40, 120], [96, 64]]
+    assert [pair["size"] for pair in told["pairs"]] == sizes
+    assert read_disparity(home / "out" / "3_disparity.png").shape == (120, 40)
+
+
+@pytest.mark.parametrize("sources", ["side by side", "two videos"])
+def test_a_video_gives_films(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str], sources: str
+) -> None:
+    files = [filmed(home / "both.mp4", PAIRS)]
+    if sources == "two videos":
+        files = [
+            filmed(home / f"{name}.mp4", list(zip(images, strict=True)))
+            for name, images in zip(("l", "r"), zip(*PAIRS, strict=True), strict=True)
+        ]
+    name = files[0].stem
+    rest = ["--model", str(models / "full.safetensors"), "--out", str(home / "out")]
+    told = report(infer, [*map(str, files), *rest], capsys)
+    films = [f"{name}_color.mp4", f"{name}_overlay.mp4"]
+    assert [path.name for path in left_behind(home)] == sorted([*films, "classes.png"])
+    stream = told.pop("stream")
+    assert stream.pop("fps") > 0
+    assert stream.pop("network_ms") > 0
+    assert stream == {
+        "name": name,
+        "size": [96, 64],
+        "frames": 3,
+        "stages": [{"stage": 3, "frames": 3}],
+        "files": films,
+    }
+    assert (told["schema"], told["pairs"], told["legend"]) == ("rts2.infer/1", [], "classes.png")
+
+
+def test_every_frame_of_a_video_can_have_its_files(
+    home: Path, models: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = filmed(home / "both.mp4", PAIRS)
+    (home / "calib.txt").write_text(CALIBRATION)
+    rest = [
+        "--model",
+        str(models / "anynet.safetensors"),
+        "--out",
+        str(home / "out"),
+        "--stages",
+        "1",
+    ]
+    more = ["--frames", "--limit", "2", "--calib", str(home / "calib.txt")]
+    told = report(infer, [str(video), *rest, *more], capsys)
+    kinds = ["cloud.ply", "color.png", "disparity.png"]
+    assert [sorted(pair["files"]) for pair in told["pairs"]] == [
+        [f"both_{index:06}_{kind}" for kind in kinds] for index in range(2)
+    ]
+    assert told["legend"] is None
+    assert len(left_behind(home)) == 2 * 3 + 1
+    left, right = next(Stream([video]).pairs())
+    wanted = open_model(models / "anynet.safetensors").predict(left, right, 1)
+    written = read_disparity(home / "out" / "both_000000_disparity.png")
+    np.testing.assert_allclose(written, wanted.disparity.clip(1 / 256), atol=0.5 / 256 + 1e-3)
+
+
+def test_the_table_of_a_video(home: Path, models: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = filmed(home / "both.mp4", PAIRS)
+    rest = ["--model", str(models / "full.safetensors"), "--out", str(home / "out")]
+    assert infer([str(video), *rest]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for words in ("full.safetensors · c=1", "96x64", "3: 3", "both_color.mp4  both_overlay.mp4"):
+        assert words in printed.out
+
+
+def test_cameras_are_seen_until_the_limit(
+    home: Path,
+    models: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import cv2
+
+    opened: list[int | str] = []
+    capture = cv2.VideoCapture
+
+    def camera(index: int | str) -> Any:
+        opened.append(index)
+        return capture(str(home / f"{index}.mp4"))
+
+    for index in range(2):
+        filmed(home / f"{index}.mp4", [(pair[index],) for pair in PAIRS])
+    monkeypatch.setattr(cv2, "VideoCapture", camera)
+    rest = ["--model", str(models / "full.safetensors"), "--out", str(home / "out"), "--limit", "2"]
+    told = report(infer, ["--camera", "0", "1", *rest], capsys)
+    assert opened == [0, 1]
+    assert (told["stream"]["name"], told["stream"]["frames"]) == ("camera0", 2)
+    assert (home / "out" / "camera0_color.mp4").is_file()
 
 
 def test_evaluation_tells_what_is_known(

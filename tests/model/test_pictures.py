@@ -1,11 +1,14 @@
 """Colours and overlays against values worked out by hand."""
 
 import numpy as np
+import pytest
 from matplotlib import colormaps
 from numpy.lib.stride_tricks import sliding_window_view
 
 from rts2.model.pictures import (
     PALETTE,
+    brightest_px,
+    captioned,
     coloured,
     legend,
     overlay,
@@ -73,3 +76,23 @@ def test_overlay_mixes_and_leaves_unlabelled_pixels() -> None:
     assert mixed.tolist() == [[[114, 82, 114], [9, 8, 7]]]
     full = overlay(image, np.array([[0, 255]], np.uint8), share=1.0)
     assert full[0, 0].tolist() == [128, 64, 128]
+
+
+@pytest.mark.parametrize("height", [32, 375])
+def test_a_caption_stands_at_the_top_left_and_nowhere_else(height: int) -> None:
+    picture = np.full((height, 400, 3), 100, np.uint8)
+    before = picture.copy()
+    found = captioned(picture, "12.3 FPS")
+    assert np.array_equal(picture, before), "the picture itself stays"
+    assert found.shape == picture.shape
+    rows, columns = np.nonzero((found != 100).any(-1))
+    assert found.max() > 200
+    assert found.min() < 20
+    assert rows.max() < max(height // 10, 20)
+    assert columns.max() < 200
+    assert np.array_equal(captioned(picture, ""), picture)
+
+
+def test_colours_end_where_two_of_a_hundred_pixels_are_brighter() -> None:
+    assert brightest_px(disparities(*range(101), NAN)) == 98
+    assert brightest_px(disparities(NAN)) == 1
