@@ -104,7 +104,7 @@ lines = open("/proc/self/status", encoding="utf-8").read().splitlines()
 peak, = [line.split()[1] for line in lines if line.startswith("VmHWM")]
 print(json.dumps([int(peak) / 1024, ready, list(session.expected_ms.values())]))
 """
-"""A fresh process with a session and nothing else: its peak in MB, its start in s, its times in ms."""
+"""A fresh process with a session alone tells its peak in MB, its start in s, its times in ms."""
 
 
 @dataclass(frozen=True)
