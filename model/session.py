@@ -11,6 +11,7 @@ one stage to a session of the next takes 5% longer than a graph that runs throug
 from __future__ import annotations
 
 from collections import deque
+from math import inf
 from pathlib import Path
 from threading import Lock
 from time import perf_counter
@@ -107,18 +108,22 @@ class StereoSession:
         """The disparity and the classes of a pair, (H, W) each, from images (H, W, 3), RGB, uint8.
 
         It runs `stages` stages, by default all that the session has; with a budget for the whole
-        call as many of them as are expected to fit, going by what calls took lately.
+        call as many of them as are expected to fit, going by what calls took lately, and the first
+        in any case.
 
         Raises:
             UsageError: the images are no such arrays or of another size, the session does not stop
-                after so many stages, or the budget is below what the first one takes.
+                after so many stages, or the first one never held the budget.
         """
         _require_pair(left, right)
         last = self._index(stages)
         chosen = last if budget_ms is None else self._fitting(last, budget_ms)
+        return self._timed(chosen, left, right)
+
+    def _timed(self, index: int, left: Bytes, right: Bytes) -> Estimate:
         started = perf_counter()
-        estimate = self._predictors[chosen].predict(left, right)
-        self._times[chosen].add(1000 * (perf_counter() - started))
+        estimate = self._predictors[index].predict(left, right)
+        self._times[index].add(1000 * (perf_counter() - started))
         return estimate
 
     def _index(self, stages: int | None) -> int:
@@ -131,26 +136,40 @@ class StereoSession:
         return known.index(stages)
 
     def _fitting(self, last: int, budget_ms: float) -> int:
-        """The last predictor up to `last` that is expected to fit into a budget."""
+        """The last predictor up to `last` that is expected to fit into a budget, else the first:
+        what it once held it may hold again.
+        """
         expected = [times.expected_ms for times in self._times[: last + 1]]
         fitting = [index for index, ms in enumerate(expected) if ms <= budget_ms]
         if not fitting:
-            raise UsageError(
-                f"a budget must hold the first stage, which takes {expected[0]:.1f} ms here; it is "
-                f"{budget_ms:g} ms: allow more, or take a smaller network"
-            )
-        for times in self._times[fitting[-1] + 1 : last + 1]:
+            self._require_enough(budget_ms)
+        chosen = max(fitting, default=0)
+        for times in self._times[chosen + 1 : last + 1]:
             times.forget_slowest()
-        return fitting[-1]
+        return chosen
+
+    def _require_enough(self, budget_ms: float) -> None:
+        """Raises `UsageError` for a budget that the first stage never held, and does not now."""
+        first = self._times[0]
+        if not first.least_ms <= budget_ms:
+            self._timed(0, *self._blank())
+        if not first.least_ms <= budget_ms:
+            raise UsageError(
+                f"a budget must hold the first stage, which takes {first.least_ms:.1f} ms here; it "
+                f"is {budget_ms:g} ms: allow more, or take a smaller network"
+            )
 
     def _warm_up(self) -> None:
-        """Runs every number of stages: once, as a first run takes longer, and then to time it."""
-        width, height = self.size
-        blank = np.zeros((height, width, 3), np.uint8)
-        for predictor in self._predictors:
-            predictor.predict(blank, blank)
+        """Times every number of stages, after a first run, which takes longer."""
+        for index, predictor in enumerate(self._predictors):
+            predictor.predict(*self._blank())
             for _ in range(TIMED):
-                self.predict(blank, blank, predictor.stages)
+                self._timed(index, *self._blank())
+
+    def _blank(self) -> tuple[Bytes, Bytes]:
+        width, height = self.size
+        image = np.zeros((height, width, 3), np.uint8)
+        return image, image
 
 
 class Sessions:
@@ -183,11 +202,14 @@ class Times:
     def __init__(self) -> None:
         self._lately: deque[float] = deque(maxlen=REMEMBERED)
         self._lock = Lock()
+        self.least_ms = inf
+        """The fastest call of all."""
 
     def add(self, ms: float) -> None:
         """One more call; the oldest that is remembered makes room for it."""
         with self._lock:
             self._lately.append(ms)
+            self.least_ms = min(self.least_ms, ms)
 
     def forget_slowest(self) -> None:
         """For a call that did not come because of these times, of which the last stays.

@@ -522,14 +522,13 @@ def test_a_budget_is_kept_in_fewer_stages(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    planted = {1: 10.0, 2: 20.0, 3: 40.0}
-    stages = iter(planted.values())
+    planted = iter((10.0, 20.0, 40.0))
 
     class Planted:
         """Calls that take as long as was planted, whatever they took."""
 
         def __init__(self) -> None:
-            self.expected_ms = next(stages)
+            self.expected_ms = next(planted)
 
         def add(self, ms: float) -> None: ...
 
