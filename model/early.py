@@ -12,15 +12,18 @@ from collections.abc import Iterable, Sequence
 import onnx
 from onnx import TensorProto, helper
 
-from .graph import DISPARITY, SEMANTIC, GraphHeader, answers, put_header
+from .graph import DISPARITY, SEMANTIC, GraphHeader, put_header
 
 
 def stops(model: onnx.ModelProto, header: GraphHeader) -> tuple[int, ...]:
     """The stages that the graph can stop after; its last one is always among them."""
-    shapes = _shapes(model)
-    stages, semantic = header.stages, header.arch.semantic
-    early = (k for k in range(1, stages) if shapes.keys() >= set(answers(k, semantic)))
-    return (*early, stages)
+    shapes, count = _shapes(model), 1 + header.arch.semantic
+    early = (
+        stage
+        for stage, values in enumerate(header.answers or (), 1)
+        if stage < header.stages and len(values) == count and shapes.keys() >= set(values)
+    )
+    return (*early, header.stages)
 
 
 def stopped(model: onnx.ModelProto, header: GraphHeader, stage: int) -> onnx.ModelProto:
@@ -32,7 +35,8 @@ def stopped(model: onnx.ModelProto, header: GraphHeader, stage: int) -> onnx.Mod
     if stage == header.stages:
         return model
     graph, (width, height) = model.graph, header.size
-    values = answers(stage, header.arch.semantic)
+    told = header.answers or ()
+    values = told[stage - 1]
     nodes = _before(graph.node, values)
     shown = [(DISPARITY, TensorProto.FLOAT), (SEMANTIC, TensorProto.INT32)][: len(values)]
     nodes += _enlarged(values[0], (height, width))
@@ -44,8 +48,12 @@ def stopped(model: onnx.ModelProto, header: GraphHeader, stage: int) -> onnx.Mod
     weights = [tensor for tensor in graph.initializer if tensor.name in used]
     body = helper.make_graph(nodes, graph.name, graph.input, outputs, weights)
     cut = helper.make_model(body, opset_imports=model.opset_import, ir_version=model.ir_version)
-    forms = None if header.forms is None else header.forms[:stage]
-    put_header(cut, header.model_copy(update={"arch": header.arch.up_to(stage), "forms": forms}))
+    own = {
+        "arch": header.arch.up_to(stage),
+        "forms": None if header.forms is None else header.forms[:stage],
+        "answers": told[: stage - 1] or None,
+    }
+    put_header(cut, header.model_copy(update=own))
     return cut
 
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from copy import deepcopy
 from importlib.metadata import version
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
 from .forms import class_ids, formed, forms_run, rewritten
-from .graph import DISPARITY, SEMANTIC, GraphHeader, answers, read_header, save_graph
+from .graph import DISPARITY, SEMANTIC, GraphHeader, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
 from .rts2net import Stage
@@ -78,7 +78,7 @@ class Deployed(nn.Module):
 class Exported(Deployed):
     """The same as a graph holds it: in forms that give the same and are faster there.
 
-    Behind the answer it tells those of the earlier stages, as `answers` names them.
+    Behind the answer it tells those of the earlier stages, as `GraphHeader.answers` has them.
     """
 
     def __init__(
@@ -130,7 +130,9 @@ def export(
         origin=origin,
         rts2=version("rts2"),
     )
-    save_graph(_traced(deployed, header, opset), header, path)
+    model, answers = _traced(deployed, header, opset)
+    header = header.model_copy(update={"answers": answers})
+    save_graph(model, header, path)
     return header
 
 
@@ -148,12 +150,13 @@ def parity(path: Path, network: Network, left: Tensor, right: Tensor) -> Parity:
     return Parity(float(np.abs(expected[0] - found[0]).max()), share)
 
 
-def _traced(deployed: Deployed, header: GraphHeader, opset: int) -> onnx.ModelProto:
-    """The network as a folded ONNX model at the padded size."""
+def _traced(
+    deployed: Exported, header: GraphHeader, opset: int
+) -> tuple[onnx.ModelProto, tuple[tuple[str, ...], ...] | None]:
+    """The network as a folded ONNX model at the padded size, and the answers within it."""
     width, height = header.size
-    arch = header.arch
-    outputs = [DISPARITY, SEMANTIC] if arch.semantic else [DISPARITY]
-    inner = [name for stage in range(1, arch.stages) for name in answers(stage, arch.semantic)]
+    outputs = [DISPARITY, SEMANTIC] if header.arch.semantic else [DISPARITY]
+    earlier = [[f"{stage} {name}" for name in outputs] for stage in range(1, header.stages)]
     # Two images that differ: of equal ones the exporter would make a single input.
     pair = torch.rand(2, 1, 3, height, width, generator=torch.Generator().manual_seed(0))
     with TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -165,18 +168,19 @@ def _traced(deployed: Deployed, header: GraphHeader, opset: int) -> onnx.ModelPr
             tuple(pair),
             file,
             input_names=["left", "right"],
-            output_names=[*outputs, *inner],
+            output_names=[*outputs, *chain(*earlier)],
             opset_version=opset,
             dynamo=False,  # the new exporter has no opset 13
         )
         model = _folded(file)
-    _rename(model.graph)
-    del model.graph.output[len(outputs) :]  # they keep their names within
+    del model.graph.output[len(outputs) :]  # the earlier answers stay, as values within
+    names = _rename(model.graph)
+    answers = tuple(tuple(names[name] for name in each) for each in earlier)
     del model.opset_import[:]
     model.opset_import.extend([onnx.helper.make_opsetid("", opset)])
     model.producer_name, model.producer_version = "rts2", header.rts2
-    model.graph.name = arch.family
-    return onnx.shape_inference.infer_shapes(model, strict_mode=True)
+    model.graph.name = header.arch.family
+    return onnx.shape_inference.infer_shapes(model, strict_mode=True), answers or None
 
 
 def _folded(file: Path) -> onnx.ModelProto:
@@ -191,8 +195,10 @@ def _folded(file: Path) -> onnx.ModelProto:
     return onnx.load_model(options.optimized_model_filepath)
 
 
-def _rename(graph: Any) -> None:
-    """Names every node after its module and operator, every value after its node."""
+def _rename(graph: Any) -> dict[str, str]:
+    """Names every node after its module and operator, every value after its node; returns the
+    new names of the values.
+    """
     fixed = {value.name for value in [*graph.input, *graph.output]}
     renamed: dict[str, str] = {}
     for node in graph.node:
@@ -203,6 +209,7 @@ def _rename(graph: Any) -> None:
     for node in graph.node:
         node.input[:] = [renamed.get(name, name) for name in node.input]
         node.output[:] = [renamed.get(name, name) for name in node.output]
+    return renamed
 
 
 def _readable(name: str) -> str:

@@ -19,16 +19,6 @@ DISPARITY, SEMANTIC = "disparity", "semantic"
 """The outputs: what the last stage says, at full resolution."""
 
 
-def answers(stage: int, semantic: bool) -> list[str]:
-    """The values of a graph that hold what stage 1, 2 … says before it is enlarged.
-
-    The best disparity, (1, 1, h, w) in pixels of the full resolution, and with a semantic branch
-    the class scores, (1, classes, h, w). They lie on the way to the last stage's answer: a graph
-    that is cut behind them stops early.
-    """
-    return [f"stage{stage}.disparity", *([f"stage{stage}.scores"] if semantic else ())]
-
-
 class GraphHeader(BaseModel):
     """What an ONNX file of ours says of itself."""
 
@@ -43,6 +33,12 @@ class GraphHeader(BaseModel):
     precision: Precision = "fp32"
     forms: tuple[Form, ...] | None = None
     """One for each stage; None where all are 3d."""
+    answers: tuple[tuple[str, ...], ...] | None = None
+    """The values that hold what each stage but the last says, before it is enlarged: the best
+    disparity, (1, 1, h, w) in pixels of the full resolution, and with a semantic branch the class
+    scores, (1, classes, h, w). They lie on the way to the last stage's answer: a graph that is cut
+    behind them stops early. None where there are none, or nobody told.
+    """
     mean: tuple[float, float, float] = MEAN
     std: tuple[float, float, float] = STD
     origin: str

@@ -8,11 +8,11 @@ import onnx
 import pytest
 import torch
 
-from rts2.model.arch import UNTRAINED, Arch
+from rts2.model.arch import UNTRAINED, Arch, Form
 from rts2.model.checkpoint import Network, build
 from rts2.model.early import stopped, stops
 from rts2.model.export import OPSETS, Deployed, export
-from rts2.model.graph import GraphHeader, answers, header_of, load_graph
+from rts2.model.graph import GraphHeader, header_of, load_graph
 from rts2.model.inference import open_session
 from rts2.model.qdq import integers, layers, nominal
 
@@ -35,11 +35,14 @@ def pair() -> dict[str, np.ndarray]:
     return {"left": images[0], "right": images[1]}
 
 
+MIXED: tuple[Form, ...] = ("3d", "banded", "banded")
+
+
 def exported(
-    network: Network, folder: Path, opset: int = 17
+    network: Network, folder: Path, opset: int = 17, forms: tuple[Form, ...] = MIXED
 ) -> tuple[onnx.ModelProto, GraphHeader]:
     path = folder / "a.onnx"
-    header = export(network, path, RESOLUTION, UNTRAINED, opset, forms=("3d", "banded", "banded"))
+    header = export(network, path, RESOLUTION, UNTRAINED, opset, forms=forms)
     return load_graph(path), header
 
 
@@ -107,7 +110,8 @@ def test_a_graph_of_integers_stops_early_too(lively: Lively, tmp_path: Path, sta
     model, header = exported(lively(build(ARCHS["full"])), tmp_path)
     made = integers(model, [layer.name for layer in layers(model)], nominal(model))
     assert stops(made, header) == (1, 2, 3)
-    name = answers(stage, semantic=True)[0]
+    assert header.answers is not None
+    name = header.answers[stage - 1][0]
     shown = onnx.ModelProto()
     shown.CopyFrom(made)
     shown.graph.output.extend([onnx.helper.make_empty_tensor_value_info(name)])
@@ -119,5 +123,20 @@ def test_a_graph_of_integers_stops_early_too(lively: Lively, tmp_path: Path, sta
 
 def test_a_graph_whose_answers_have_no_names_runs_whole(tmp_path: Path) -> None:
     model, header = exported(build(ARCHS["full"]), tmp_path)
-    del model.graph.value_info[:]
-    assert stops(model, header) == (3,)
+    assert stops(model, header.model_copy(update={"answers": None})) == (3,)
+    others = (("none", "none"), header.answers[1] if header.answers else ())
+    assert stops(model, header.model_copy(update={"answers": others})) == (2, 3)
+    assert stops(model, header.model_copy(update={"answers": (("a",),) * 5})) == (3,)
+
+
+def test_a_graph_of_one_stage_has_nowhere_else_to_stop(tmp_path: Path) -> None:
+    model, header = exported(build(Arch(c=1, stages=1)), tmp_path, forms=("3d",))
+    assert header.answers is None
+    assert stops(model, header) == (1,)
+
+
+def test_a_graph_of_fewer_stages_than_its_network_stops_before_them(tmp_path: Path) -> None:
+    header = export(build(ARCHS["full"]), tmp_path / "a.onnx", RESOLUTION, UNTRAINED, stages=2)
+    assert header.answers is not None
+    assert len(header.answers) == 1
+    assert stops(load_graph(tmp_path / "a.onnx"), header) == (1, 2)

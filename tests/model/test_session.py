@@ -18,7 +18,7 @@ from rts2.model.data.images import read_rgb
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.export import export
 from rts2.model.files import sha256
-from rts2.model.graph import load_graph
+from rts2.model.graph import header_of, load_graph, save_graph
 from rts2.model.predictor import TorchPredictor
 from rts2.model.session import OPEN, REMEMBERED, Sessions, StereoSession, Times
 
@@ -298,10 +298,10 @@ def test_a_graph_of_another_tool_runs_as_it_is(tmp_path: Path) -> None:
         StereoSession(tmp_path / "a.onnx", stages=1)
 
 
-def test_a_graph_without_names_of_its_stages_cannot_stop(model: Path, tmp_path: Path) -> None:
+def test_a_graph_that_tells_no_answers_cannot_stop(model: Path, tmp_path: Path) -> None:
     graph = load_graph(model)
-    del graph.graph.value_info[:]
-    onnx.save(graph, tmp_path / "a.onnx")
+    header = header_of(graph, model).model_copy(update={"answers": None})
+    save_graph(graph, header, tmp_path / "a.onnx")
     assert StereoSession(tmp_path / "a.onnx").predict(*pair(), stages=3).stage == 3
     with pytest.raises(UsageError, match=r"runs 3 stages here, not 1; .* give the checkpoint"):
         StereoSession(tmp_path / "a.onnx", stages=1)
