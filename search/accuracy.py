@@ -94,10 +94,11 @@ class MeasuredRows(BaseModel):
 
     @model_validator(mode="after")
     def _distinct(self) -> MeasuredRows:
-        archs = [row.arch for row in self.rows]
+        seen: set[Arch] = set()
         for at, row in enumerate(self.rows):
-            if row.arch in archs[:at]:
+            if row.arch in seen:
                 raise ValueError(f"rows.{at} names {row.arch.label()} twice")
+            seen.add(row.arch)
             if all(row.value(metric) is None for metric in METRICS):
                 raise ValueError(f"rows.{at} measures nothing; give one of {', '.join(METRICS)}")
         return self
