@@ -30,7 +30,7 @@ ROWS: Final = "rows"
 REASON: Final = "reason"
 """The attribute of a trial that tells why its evaluation failed."""
 
-OPTIMISM: Final = 1.0
+OPTIMISM: Final = 2.0
 """Standard deviations by which a prediction is taken for better than it is expected to be."""
 
 RIDGES: Final = np.geomspace(1e-4, 1e2, 13)
@@ -212,36 +212,45 @@ class FrontSampler(BaseSampler):
         return self._rows[trial.number]
 
     def _gains(self, rows: Sequence[Row], running: Chosen) -> Floats:
-        """What each chain promises to add to the fronts, as shares of what they have."""
+        """What each chain promises to add to the fronts, as shares of what they have.
+
+        With several metrics there is a front for each, and for mixtures of them, as a network may
+        be the best in none and a good one in all.
+        """
+        judged = [self._judged(metric, rows, running) for metric in self.metrics]
         gains = np.zeros(self.chains.size)
-        for metric in self.metrics:
-            known, hoped = self._judged(metric, rows, running)
-            for proven in (True, False):
-                courses = [each for each in self.landscape.courses if each.proven == proven]
-                if courses:
-                    gains += self._promised(metric, courses, known, hoped)
+        for proven in (True, False):
+            courses = [each for each in self.landscape.courses if each.proven == proven]
+            if courses:
+                known, hoped = (
+                    self._losses(courses, losses) for losses in zip(*judged, strict=True)
+                )
+                for weights in _mixtures(known):
+                    gains += self._promised(courses, _mixed(weights, known), _mixed(weights, hoped))
         return gains
 
-    def _promised(
-        self,
-        metric: Metric,
-        courses: Sequence[Course],
-        known: Mapping[int, Floats],
-        hoped: Mapping[int, Floats],
-    ) -> Floats:
+    def _losses(self, courses: Sequence[Course], losses: Sequence[Mapping[int, Floats]]) -> Floats:
+        """The losses of all courses' networks, each in its precision: (metrics, networks)."""
+        pairs = list(zip(self.metrics, losses, strict=True))
+        return np.stack(
+            [np.concatenate([_changed(c, metric, own) for c in courses]) for metric, own in pairs]
+        )
+
+    def _promised(self, courses: Sequence[Course], known: Floats, hoped: Floats) -> Floats:
         """What the best network of each chain promises to add to one front."""
-        losses = np.concatenate([_losses(course, metric, known) for course in courses])
-        latency = np.concatenate([course.latency_ms for course in courses])
-        told = ~np.isnan(losses)
+        told = ~np.isnan(known)
         if not told.any():
             return np.zeros(self.chains.size)
-        worst = float(losses[told].max() + MARGIN * max(float(np.ptp(losses[told])), 1e-9))
-        front = Staircase.of(latency[told], losses[told], self.landscape.target_ms, worst)
+        latency = np.concatenate([course.latency_ms for course in courses])
+        worst = float(known[told].max() + MARGIN * max(float(np.ptp(known[told])), 1e-9))
+        front = Staircase.of(latency[told], known[told], self.landscape.target_ms, worst)
+        gains = front.gains(latency, hoped)
         best = {stages: np.zeros(self.chains.count(stages)) for stages in self._stages}
+        start = 0
         for course in courses:
-            gains = front.gains(course.latency_ms, _losses(course, metric, hoped))
-            own = best[course.stages]
-            np.maximum.at(own, course.at % len(own), gains)
+            own, stop = best[course.stages], start + len(course.at)
+            np.maximum.at(own, course.at % len(own), gains[start:stop])
+            start = stop
         each = [own[self._beginning[stages]] for stages, own in best.items()]
         found: Floats = np.max(each, axis=0) / max(front.area, 1e-12)
         return found
@@ -300,7 +309,22 @@ def as_stored(rows: Iterable[Row]) -> str:
     return json.dumps([row.model_dump(mode="json") for row in rows])
 
 
-def _losses(course: Course, metric: Metric, losses: Mapping[int, Floats]) -> Floats:
+def _changed(course: Course, metric: Metric, losses: Mapping[int, Floats]) -> Floats:
     """The losses of a course's networks in its precision."""
     direction = 1 if LOWER_IS_BETTER[metric] else -1
     return losses[course.stages][course.at] + direction * course.changes[metric]
+
+
+def _mixtures(known: Floats) -> Floats:
+    """Weights that bring metrics to one scale, each alone and all together: (mixtures, metrics)."""
+    told = known[:, ~np.isnan(known).any(axis=0)]
+    if not told.size or len(known) == 1:
+        return np.eye(len(known))
+    scales = 1 / np.maximum(np.ptp(told, axis=1), 1e-9)
+    return np.concatenate([np.eye(len(known)), np.ones((1, len(known)))]) * scales
+
+
+def _mixed(weights: Floats, losses: Floats) -> Floats:
+    """The weighted sum; what weighs nothing may be unknown."""
+    own = weights > 0
+    return weights[own] @ losses[own]

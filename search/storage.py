@@ -31,7 +31,7 @@ def opened(url: str, heartbeat_s: int, grace_s: int) -> RDBStorage:
     """
     waiting = {"timeout": LOCKED_S} if url.startswith("sqlite") else {}
     return RDBStorage(
-        url,
+        _driven(url),
         engine_kwargs={"connect_args": waiting, "pool_pre_ping": True},
         heartbeat_interval=heartbeat_s,
         grace_period=grace_s,
@@ -59,8 +59,8 @@ def reached(url: str) -> Iterator[None]:
         ) from error
     except ImportError as error:
         raise UsageError(
-            f"--storage {told} needs a driver that is not installed; pip install "
-            "'rts2[postgresql]' brings PostgreSQL's"
+            f"--storage {told} needs a driver that is not installed: {one_line(error)}; pip "
+            "install 'rts2[postgresql]' brings PostgreSQL's"
         ) from error
     except (StorageInternalError, SQLAlchemyError) as error:
         cause = error.__cause__ or error
@@ -71,6 +71,16 @@ def reached(url: str) -> Iterator[None]:
         ) from error
     except RuntimeError as error:
         raise Rts2Error(f"--storage {told}: {one_line(error)}; take another database") from error
+
+
+def _driven(url: str) -> str:
+    """A plain `postgresql://` means the driver that `rts2[postgresql]` brings, whatever the one is
+    that SQLAlchemy would take.
+    """
+    known = make_url(url)
+    if known.drivername == "postgresql":
+        known = known.set(drivername="postgresql+psycopg2")
+    return known.render_as_string(hide_password=False)
 
 
 def without_password(url: str) -> str:
