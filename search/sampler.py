@@ -155,21 +155,26 @@ class FrontSampler(BaseSampler):
         self._rows: dict[int, tuple[Row, ...]] = {}
 
     def infer_relative_search_space(
-        self, study: Study, trial: FrozenTrial
+        self,
+        study: Study,  # noqa: ARG002  # Optuna's interface
+        trial: FrozenTrial,  # noqa: ARG002
     ) -> dict[str, BaseDistribution]:
         return self.dimensions()
 
     def sample_relative(
-        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+        self,
+        study: Study,
+        trial: FrozenTrial,  # noqa: ARG002
+        search_space: dict[str, BaseDistribution],  # noqa: ARG002
     ) -> dict[str, Any]:
         return self.proposed(study)
 
     def sample_independent(
         self,
-        study: Study,
-        trial: FrozenTrial,
+        study: Study,  # noqa: ARG002
+        trial: FrozenTrial,  # noqa: ARG002
         param_name: str,
-        param_distribution: BaseDistribution,
+        param_distribution: BaseDistribution,  # noqa: ARG002
     ) -> Any:
         """What is left where every chain is taken: the first value."""
         return self.chains.axes[param_name][0]
@@ -312,7 +317,8 @@ def as_stored(rows: Iterable[Row]) -> str:
 def _changed(course: Course, metric: Metric, losses: Mapping[int, Floats]) -> Floats:
     """The losses of a course's networks in its precision."""
     direction = 1 if LOWER_IS_BETTER[metric] else -1
-    return losses[course.stages][course.at] + direction * course.changes[metric]
+    found: Floats = losses[course.stages][course.at] + direction * course.changes[metric]
+    return found
 
 
 def _mixtures(known: Floats) -> Floats:
@@ -327,4 +333,5 @@ def _mixtures(known: Floats) -> Floats:
 def _mixed(weights: Floats, losses: Floats) -> Floats:
     """The weighted sum; what weighs nothing may be unknown."""
     own = weights > 0
-    return weights[own] @ losses[own]
+    found: Floats = weights[own] @ losses[own]
+    return found

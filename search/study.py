@@ -17,10 +17,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from ..model.arch import Arch
@@ -149,11 +150,13 @@ class Work:
             )
         first = _analytic(order.question, chains)
         self.sampler = FrontSampler(self.landscape, order.metrics, first)
-        self.study = _joined(name_of(order, self.judge.digest), order, self.sampler)
+        self.study, self._storage = _joined(name_of(order, self.judge.digest), order, self.sampler)
+        self._nameless: dict[int, float] = {}
+        """Since when running trials are known that name no worker."""
 
     def run(self, shown: Shown = unseen) -> None:
         """Judges one chain after another until the budget is spent or nothing is left."""
-        self._free_own()
+        self._free_lost()
         while not self._spent():
             shown(self.progress())
             with reached(self.order.storage):
@@ -161,6 +164,7 @@ class Work:
                     self.study.optimize(self._judged, n_trials=1, catch=(Exception,))
                 else:
                     optuna.storages.fail_stale_trials(self.study)
+                    self._free_lost()
                     time.sleep(POLL_S)
         shown(self.progress())
 
@@ -225,13 +229,19 @@ class Work:
 
     def _judged(self, trial: Trial) -> tuple[float, ...]:
         """The objectives of one chain: latency and accuracies of its best network."""
+        # In this order: a trial that names its worker has a heartbeat that can fall silent.
+        self._storage.record_heartbeat(trial._trial_id)
         trial.set_user_attr(WORKER, _own_name())
         values = {
             name: trial._suggest(name, axis) for name, axis in self.sampler.dimensions().items()
         }
         if not self._first_of(trial.number):
             raise optuna.TrialPruned
-        arch, known, started = self.sampler.chains.arch(values), self.judge.hits, time.perf_counter()
+        arch, known, started = (
+            self.sampler.chains.arch(values),
+            self.judge.hits,
+            time.perf_counter(),
+        )
         try:
             rows = self.judge.rows(arch)
             found = self._objectives(rows)
@@ -267,10 +277,15 @@ class Work:
             raise Rts2Error(f"no {' and '.join(metrics)} came of it")
         return min(found)[1:]
 
-    def _free_own(self) -> None:
-        """Frees what dead workers of this machine had in flight, without waiting for silence."""
+    def _free_lost(self) -> None:
+        """Frees what no heartbeat tells of: what dead workers of this machine had in flight, at
+        once, and what was taken by one that died before it gave its name.
+        """
         for trial in self._trials(TrialState.RUNNING):
-            if _dead(trial.user_attrs.get(WORKER)):
+            worker = trial.user_attrs.get(WORKER)
+            since = self._nameless.setdefault(trial.number, time.monotonic())
+            nameless = worker is None and time.monotonic() - since > self.order.grace_s
+            if nameless or _dead(worker):
                 try:
                     self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
                 except UpdateFinishedTrialError:
@@ -291,7 +306,7 @@ def run(order: Order, workers: int = 1, shown: Shown = unseen) -> Studied:
 
 def found_by(order: Order, studied: Studied) -> Found:
     """The exact front over everything that the study judged."""
-    rows = MeasuredRows(schema_="rts2.accuracy/1", rows=studied.rows)
+    rows = MeasuredRows(schema="rts2.accuracy/1", rows=studied.rows)
     return search_all(order.question, Measured(rows))
 
 
@@ -348,8 +363,11 @@ def _analytic(question: Question, chains: Chains) -> list[int]:
     return [numbers[place] for place in sorted(places)] if numbers else []
 
 
-def _joined(name: str, order: Order, sampler: FrontSampler) -> optuna.Study:
-    accuracies = ["minimize" if LOWER_IS_BETTER[m] else "maximize" for m in order.metrics]
+def _joined(name: str, order: Order, sampler: FrontSampler) -> tuple[optuna.Study, RDBStorage]:
+    """The study, and the database that keeps it."""
+    accuracies: list[Literal["minimize", "maximize"]] = [
+        "minimize" if LOWER_IS_BETTER[m] else "maximize" for m in order.metrics
+    ]
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     with reached(order.storage):
         storage = opened(order.storage, order.heartbeat_s, order.grace_s)
@@ -358,13 +376,14 @@ def _joined(name: str, order: Order, sampler: FrontSampler) -> optuna.Study:
             text = "note: %s holds studies of another supernet, data, device or question; "
             text += "this one begins anew beside them"
             logging.getLogger(__name__).warning(text, without_password(order.storage))
-        return optuna.create_study(
+        study = optuna.create_study(
             study_name=name,
             storage=storage,
             sampler=sampler,
             directions=["minimize", *accuracies],
             load_if_exists=True,
         )
+    return study, storage
 
 
 def _own_name() -> str:

@@ -23,6 +23,9 @@ from rts2.search.study import Order, run
 SMALL = Space(c=(1, 2, 4, 8), d_max=(6, 12), conv3d=((16,), (4,), (2, 4)))
 """16 chains."""
 
+MEDIUM = Space(c=(1, 2, 4, 8), d_max=(6, 12, 24), conv3d=((16, 32), (4,), (2, 4)))
+"""48 chains."""
+
 GRID = Space(
     c=(1, 2, 3, 4, 6, 8, 11, 16, 23, 32),
     d_max=(6, 9, 12, 16, 24),
@@ -93,6 +96,5 @@ def _same(judge: StandIn) -> StandIn:
 if __name__ == "__main__":
     url, journal, budget, workers = sys.argv[1:]
     patient = StandIn(Path(journal), 0.15)
-    asked = order(url, patient, int(budget), heartbeat_s=1, grace_s=2)
-    found = run(asked, int(workers))
-    print(found.evaluations, found.fresh)
+    asked = order(url, patient, int(budget), MEDIUM, heartbeat_s=1, grace_s=2)
+    run(asked, int(workers))
