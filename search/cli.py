@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import get_args
+from time import perf_counter
+from typing import TYPE_CHECKING, get_args
 
 from ..model.arch import Precision
 from ..model.bundle import CONFIGURATION
@@ -22,7 +24,9 @@ from ..model.console import (
     print_json,
     resolution,
     screen,
+    whole_between,
 )
+from ..model.data.catalog import DATASETS, STREETS
 from ..model.errors import NothingFeasible, UsageError
 from ..model.files import output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
@@ -33,7 +37,11 @@ from .deploy.cli import deploy
 from .deploy.configuration import of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
-from .result import Found, Task
+from .result import Cost, Found, Task
+from .supernet import supernet
+
+if TYPE_CHECKING:
+    from .study import Order, Progress, Shown
 
 __all__ = ["deploy", "search"]
 
@@ -44,11 +52,17 @@ def search(arguments: Sequence[str] | None = None) -> int:
     options = _search_parser().parse_args(arguments)
     profile = load(options.device)
     out = output_folder(options.out)
-    found = search_all(_question(options, profile), source(options.accuracy))
+    question = _question(options, profile)
+    weights = supernet(options.accuracy)
+    _require_supernet(options, weights)
+    if weights is None:
+        found = search_all(question, source(options.accuracy))
+    else:
+        found = _measured(options, question, weights)
     _warn_of_differences(profile, options.device)
     written = _write(found, profile, out)
     if options.json:
-        print_json(found.model_dump(mode="json", by_alias=True))
+        print_json(found.to_json())
     else:
         from .report import show
 
@@ -56,6 +70,94 @@ def search(arguments: Sequence[str] | None = None) -> int:
     if found.selected is None:
         raise NothingFeasible(_infeasible(found, profile))
     return 0
+
+
+def _require_supernet(options: argparse.Namespace, weights: Path | None) -> None:
+    """Raises `UsageError` for a study's options without a supernet, and for one without data."""
+    given = [name for name in STUDY if getattr(options, name) not in (None, False)]
+    if weights is None and given:
+        option = given[0].replace("_", "-")
+        raise UsageError(
+            f"--{option} is for --accuracy SUPERNET, the weights that rts2-train --supernet makes; "
+            f"{options.accuracy} is none"
+        )
+    if weights is not None and options.data is None:
+        raise UsageError(f"{weights} is judged on your data; give --data DIR, or --data {STREETS}")
+
+
+def _measured(options: argparse.Namespace, question: Question, weights: Path) -> Found:
+    """What a study of a supernet finds; writes the pick's weights."""
+    from .storage import sqlite
+    from .study import BUDGET, Order, found_by, run
+    from .supernet import CACHE, Source, trained_s
+
+    started = perf_counter()
+    workers = options.workers or 1
+    judge = Source(
+        path=weights,
+        data=options.data,
+        dataset=options.dataset,
+        split=options.split,
+        size=options.data_size or question.resolution,
+        folder=options.out / CACHE,
+        threads=max(1, cores() // workers),
+    )
+    order = Order(
+        question=question,
+        judge=judge.open,
+        storage=options.storage or sqlite(options.out / "study.db"),
+        metrics=judge.metrics(question.objective, question.task),
+        budget=options.budget or BUDGET,
+    )
+    with _bar(order) as shown:
+        studied = run(order, workers, shown)
+    found = found_by(order, studied)
+    for reason in studied.failed:
+        logging.getLogger(__name__).warning("note: an evaluation failed: %s", reason)
+    cost = Cost(
+        wall_s=perf_counter() - started,
+        evaluations=studied.evaluations,
+        fresh=studied.fresh,
+        cache_hits=studied.recalled,
+        failed=len(studied.failed),
+        workers=studied.workers,
+        evaluation_s=studied.seconds,
+        candidates=studied.candidates,
+        training_s=trained_s(weights),
+    )
+    own = judge.open()
+    if options.verify:
+        from .verify import verified
+
+        found = verified(found, question, own.network)
+    if found.selected is not None:
+        from ..model.checkpoint import save
+
+        arch = found.selected.arch
+        origin = f"cut out of a supernet ({own.origin}), norms calibrated on {options.data}"
+        save(own.network(arch), options.out / PICK, origin)
+    else:
+        remove(options.out / PICK)
+    return found.model_copy(update={"cost": cost})
+
+
+@contextmanager
+def _bar(order: Order) -> Iterator[Shown]:
+    """Shows on a terminal's stderr how far a study is, and the best so far."""
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    from .report import caption
+
+    console = Console(stderr=True)
+    with Bar(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("networks", total=order.budget)
+
+        def shown(at: Progress) -> None:
+            told = caption(order.metrics[0], at.best)
+            bar.update(task, completed=at.done + at.failed, description=f"networks, best {told}")
+
+        yield shown
 
 
 def _warn_of_differences(profile: Profile, device: str) -> None:
@@ -88,8 +190,12 @@ def _search_parser() -> argparse.ArgumentParser:
     add("--task", choices=get_args(Task), default="semantic-stereo", help=text)
     text = "what accuracy means (default: d1_all)"
     add("--objective", choices=("d1_all", "epe", "miou"), default="d1_all", help=text)
-    text = "the paper's tables, or a JSON file of measured accuracies"
+    text = (
+        "the paper's tables, a JSON file of measured accuracies, or a supernet's weights, which "
+        "judge networks on --data"
+    )
     add("--accuracy", default="published", metavar="published|PATH", help=text)
+    _add_study(described)
     text = "only this precision (may be repeated)"
     add("--precision", action="append", choices=get_args(Precision), default=[], help=text)
     text = "only this runtime (may be repeated)"
@@ -103,6 +209,43 @@ def _search_parser() -> argparse.ArgumentParser:
     add("--baseline", type=positive, metavar="M", help="distance of the cameras, in metres")
     add_output(described)
     return described
+
+
+STUDY = ("data", "dataset", "split", "data_size", "budget", "workers", "storage", "verify")
+"""The options of a measured search."""
+
+PICK = "pick.safetensors"
+"""The weights of a measured search's pick."""
+
+
+def _add_study(described: argparse.ArgumentParser) -> None:
+    add = described.add_argument_group("when a supernet judges").add_argument
+    text = f"what judges: a data set's folder, or generated {STREETS}"
+    add("--data", type=Path, metavar=f"DIR|{STREETS}", help=text)
+    text = "which data set the folder holds (default: told by its layout)"
+    add("--dataset", choices=[name for name in DATASETS if name != STREETS], help=text)
+    text = "what of it judges: one of its splits, or a file that lists frames"
+    add("--split", metavar="NAME|FILE", help=text)
+    text = f"size of the {STREETS}, WxH (default: the search's)"
+    add("--data-size", type=resolution, metavar="WxH", help=text)
+    text = "how many evaluations, nine networks each (default: 200)"
+    add("--budget", type=_budget, metavar="N", help=text)
+    add("--workers", type=_workers, metavar="N", help="processes on this machine (default: 1)")
+    text = (
+        "the database that keeps the study, for workers on other machines; sqlite:///FILE or "
+        "postgresql://… (default: study.db in --out)"
+    )
+    add("--storage", metavar="URL", help=text)
+    text = "times every point of the front on this device, where it is the device"
+    add("--verify", action="store_true", help=text)
+
+
+def _budget(text: str) -> int:
+    return whole_between(text, 1, 1_000_000)
+
+
+def _workers(text: str) -> int:
+    return whole_between(text, 1, 256)
 
 
 def _probability(text: str) -> float:
@@ -145,10 +288,12 @@ def _write(found: Found, profile: Profile, out: Path) -> list[str]:
     from .plot import save
     from .report import as_csv
 
-    write_json(out / "front.json", found.model_dump(mode="json", by_alias=True))
+    write_json(out / "front.json", found.to_json())
     write_bytes(out / "front.csv", as_csv(found).encode())
     save(found, profile.title, out / "front.png")
     written = [f"{out}/", "front.json", "front.csv", "front.png"]
+    if found.cost is not None and found.selected is not None:
+        written.append(PICK)
     if found.selected is None:
         remove(out / CONFIGURATION)
         return written

@@ -138,7 +138,7 @@ def search(
         confidence=question.confidence,
         space=Coverage(size=size, evaluated=size, exhaustive=True),
         front=tuple(front),
-        **_choices(question, front),
+        **choices(question, front),
         left_out=tuple(LeftOut(reason=r, count=n) for r, n in left_out.most_common()),
         elapsed_s=time.perf_counter() - started,
     )
@@ -178,13 +178,15 @@ def speeds(question: Question, space: Space) -> Iterator[Speed]:
             yield Speed(stages, executor, latency, proven)
 
 
-class _Choices(TypedDict):
+class Choices(TypedDict):
+    """What of a front is told by name."""
+
     selected: Point | None
     prospect: Point | None
     nearest: Point | None
 
 
-def _choices(question: Question, front: list[Point]) -> _Choices:
+def choices(question: Question, front: list[Point]) -> Choices:
     """The pick on proven numbers, what extrapolation could win, the fastest where none meets.
 
     The prospect trusts extrapolated latency, and extrapolated accuracy only where no other is.

@@ -65,7 +65,7 @@ def show(found: Found, profile: Profile, written: Sequence[str], console: Consol
     scope = f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
     console.print(Text(f"{headline(found, profile.title)} · {scope}\n"))
     console.print(_table(found, console.width))
-    lines = [*_verdict(found), *_left_out(found), *_notes(found, profile)]
+    lines = [*_verdict(found), *_cost(found), *_left_out(found), *_notes(found, profile)]
     for label, text in [*lines, ("written", "  ".join(written))]:
         row = Table.grid(padding=(0, 2))
         row.add_column(width=9)
@@ -212,6 +212,30 @@ def _no_pick(found: Found) -> str:
     if found.nearest is None:
         return f"{rule}; no candidate is left"
     return f"{rule}; the fastest is {_sentence(found, found.nearest)}"
+
+
+def _cost(found: Found) -> list[tuple[str, str]]:
+    """What measuring took, and what timing changed."""
+    lines = []
+    if (seen := found.verified) is not None:
+        told = f"{seen.timed} points timed on this device"
+        if seen.predicted:
+            told += f", {seen.predicted} could not be, and keep their predictions"
+        lines.append(("verified", told))
+        if seen.demoted is not None:
+            told = f"{_sentence(found, seen.demoted)}: was the pick, and misses the target"
+            lines.append(("demoted", told))
+    if (cost := found.cost) is not None:
+        workers = "1 worker" if cost.workers == 1 else f"{cost.workers} workers"
+        told = (
+            f"{cost.evaluations} of {cost.candidates:,} chains judged ({cost.fresh} in this run, "
+            f"{cost.cache_hits} known from before, {cost.failed} failed) by {workers}; "
+            f"{cost.wall_s:.0f} s now, evaluations {cost.evaluation_s:.0f} s in all"
+        )
+        if cost.training_s is not None:
+            told += f", the supernet trained {cost.training_s:.0f} s"
+        lines.append(("cost", told))
+    return lines
 
 
 def _left_out(found: Found) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -16,6 +16,7 @@ from .accuracy import Metric
 Task = Literal["semantic-stereo", "stereo"]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0)]
 
 
@@ -75,6 +76,38 @@ class Coverage(_Frozen):
     exhaustive: bool
 
 
+class Cost(_Frozen):
+    """What a measured search took."""
+
+    wall_s: Seconds
+    """Of this run."""
+    evaluations: Count
+    """Chains judged in this study, in all its runs."""
+    fresh: Count
+    """Of them in this run, by all workers."""
+    cache_hits: Count
+    """Of all evaluations those that the cache on disk told."""
+    failed: Count
+    workers: Count
+    """Processes that judged, in all runs."""
+    evaluation_s: Seconds
+    """What the evaluations took, all workers together."""
+    candidates: Count
+    """Chains that hold a network which meets the target."""
+    training_s: Seconds | None
+    """How long the supernet trained; None where no record tells."""
+
+
+class Verified(_Frozen):
+    """What was timed again on the device itself."""
+
+    timed: Count
+    predicted: Count
+    """Points that could not be timed here, and keep their predictions."""
+    demoted: Point | None
+    """The pick by prediction, as timed, where it misses the target."""
+
+
 class Found(_Frozen):
     """The result of a search: schema rts2.search/1."""
 
@@ -92,7 +125,17 @@ class Found(_Frozen):
     prospect: Point | None
     nearest: Point | None
     left_out: tuple[LeftOut, ...]
-    elapsed_s: Annotated[float, Field(ge=0)]
+    elapsed_s: Seconds
+    cost: Cost | None = None
+    """Of a measured search."""
+    verified: Verified | None = None
+    """Where the front was timed."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As it stands in front.json; a search that measured nothing tells no cost of it."""
+        told = self.model_dump(mode="json", by_alias=True)
+        optional = ("cost", "verified")
+        return {name: each for name, each in told.items() if each or name not in optional}
 
 
 def read(path: Path) -> Found:
