@@ -26,7 +26,6 @@ from ..model.console import (
     screen,
     whole_between,
 )
-from ..model.data.catalog import DATASETS, STREETS
 from ..model.errors import NothingFeasible, UsageError
 from ..model.files import output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
@@ -62,7 +61,7 @@ def search(arguments: Sequence[str] | None = None) -> int:
     _warn_of_differences(profile, options.device)
     written = _write(found, profile, out)
     if options.json:
-        print_json(found.to_json())
+        print_json(found.model_dump(mode="json", by_alias=True))
     else:
         from .report import show
 
@@ -90,6 +89,10 @@ def _measured(options: argparse.Namespace, question: Question, weights: Path) ->
     from .storage import sqlite
     from .study import BUDGET, Order, found_by, run
     from .supernet import CACHE, Source, trained_s
+    from .verify import require_here, verified
+
+    if options.verify:
+        require_here(question.profile)
 
     started = perf_counter()
     workers = options.workers or 1
@@ -127,8 +130,6 @@ def _measured(options: argparse.Namespace, question: Question, weights: Path) ->
     )
     own = judge.open()
     if options.verify:
-        from .verify import verified
-
         found = verified(found, question, own.network)
     if found.selected is not None:
         from ..model.checkpoint import save
@@ -211,6 +212,9 @@ def _search_parser() -> argparse.ArgumentParser:
     return described
 
 
+STREETS = "streets"
+"""The generated scenes by name; the catalog of data sets itself imports what reads images."""
+
 STUDY = ("data", "dataset", "split", "data_size", "budget", "workers", "storage", "verify")
 """The options of a measured search."""
 
@@ -223,7 +227,7 @@ def _add_study(described: argparse.ArgumentParser) -> None:
     text = f"what judges: a data set's folder, or generated {STREETS}"
     add("--data", type=Path, metavar=f"DIR|{STREETS}", help=text)
     text = "which data set the folder holds (default: told by its layout)"
-    add("--dataset", choices=[name for name in DATASETS if name != STREETS], help=text)
+    add("--dataset", metavar="NAME", help=text)
     text = "what of it judges: one of its splits, or a file that lists frames"
     add("--split", metavar="NAME|FILE", help=text)
     text = f"size of the {STREETS}, WxH (default: the search's)"
@@ -288,7 +292,7 @@ def _write(found: Found, profile: Profile, out: Path) -> list[str]:
     from .plot import save
     from .report import as_csv
 
-    write_json(out / "front.json", found.to_json())
+    write_json(out / "front.json", found.model_dump(mode="json", by_alias=True))
     write_bytes(out / "front.csv", as_csv(found).encode())
     save(found, profile.title, out / "front.png")
     written = [f"{out}/", "front.json", "front.csv", "front.png"]

@@ -168,11 +168,11 @@ def speeds(question: Question, space: Space) -> Iterator[Speed]:
             none = np.zeros(space.shape(stages), dtype=bool)
             nothing = Accuracy({}, none, none)
             block = _Block(space, question, executor, nothing, True, totals, stages)
-            latency, evidence = block.timed()
+            latency, evidence = block._latency()
             latency, proven = latency.reshape(-1), evidence.reshape(-1) != EXTRAPOLATED
             if question.at_lower_bound:
-                latency = latency * np.exp(block.half_width(np.arange(len(latency)), ~proven))
-            for _, flags in block.unfit():
+                latency = latency * np.exp(block._half_width(np.arange(len(latency)), ~proven))
+            for _, flags in block._unfit():
                 refused = np.broadcast_to(flags, block.shape).reshape(-1)
                 latency = np.where(refused, np.inf, latency)
             yield Speed(stages, executor, latency, proven)
@@ -297,10 +297,10 @@ class _Block:
         return {reason: count for reason, count in counts.items() if count}
 
     def _exclusions(self) -> Iterator[tuple[str, Flags]]:
-        yield from self.unfit()
+        yield from self._unfit()
         yield from self._unknown()
 
-    def unfit(self) -> Iterator[tuple[str, Flags]]:
+    def _unfit(self) -> Iterator[tuple[str, Flags]]:
         """Candidates that the question does not admit, whatever their accuracy."""
         question, space, stages = self.question, self.space, self.stages
         if question.task == "semantic-stereo":
@@ -330,7 +330,7 @@ class _Block:
     def columns(self, executor: int, exact: Evidence) -> _Columns:
         """What is left, flattened. `exact` is what a row of the accuracy source counts as."""
         at = np.flatnonzero(self._free)
-        latency, timing = self.timed()
+        latency, timing = self._latency()
         latency, timing = latency.reshape(-1)[at], timing.reshape(-1)[at]
         metrics = [self.accuracy.metrics[metric].reshape(-1)[at] for metric in METRICS]
         evidence = np.stack([timing, self._accuracy_evidence(exact).reshape(-1)[at]], 1)
@@ -339,7 +339,7 @@ class _Block:
             stages=np.full(len(at), self.stages),
             position=at,
             latency_ms=latency,
-            half_width=self.half_width(at, timing == EXTRAPOLATED),
+            half_width=self._half_width(at, timing == EXTRAPOLATED),
             metrics=np.stack(metrics, 1),
             evidence=evidence,
         )
@@ -353,7 +353,7 @@ class _Block:
         known = np.where(self.accuracy.exact, told, between)
         return np.where(self.accuracy.extrapolated, EXTRAPOLATED, known)
 
-    def timed(self) -> tuple[Floats, NDArray[np.int64]]:
+    def _latency(self) -> tuple[Floats, NDArray[np.int64]]:
         """Latencies, timings put in where there are any, and the evidence of each."""
         box = boxes(timing.arch for timing in self._timings()).get(self.stages)
         if self.executor.derived or box is None or not self._resolution_known():
@@ -376,7 +376,7 @@ class _Block:
             evidence[position] = EVIDENCE.index(timing.evidence)
         return latency, evidence
 
-    def half_width(self, at: NDArray[np.int64], extrapolated: Flags) -> Floats:
+    def _half_width(self, at: NDArray[np.int64], extrapolated: Flags) -> Floats:
         """The interval's half width in natural logarithm, for the positions `at`.
 
         Where the model extrapolates, each step away from what was calibrated (to this executor,

@@ -47,6 +47,8 @@ def draw(found: Found, title: str) -> Figure:
     ):
         if point is not None:
             _mark(axes, found, point, role, color)
+    if found.verified is not None and found.verified.demoted is not None:
+        _mark(axes, found, found.verified.demoted, "demoted, misses the target", INK, "X")
     _series(axes, found, proven, INK)
     _series(axes, found, promised, PROMISE)
     axes.axvline(found.target_fps, color=ACCENT, linestyle="--", linewidth=1)
@@ -114,8 +116,8 @@ def _group(
     )
 
 
-def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None:
-    """A star, and in the legend what it stands for."""
+def _mark(axes: Axes, found: Found, point: Point, role: str, color: str, marker: str = "*") -> None:
+    """A star or another marker, and in the legend what it stands for."""
     value = point.metric(found.objective)
     if value is None:
         return
@@ -124,7 +126,7 @@ def _mark(axes: Axes, found: Found, point: Point, role: str, color: str) -> None
     axes.plot(
         [point.fps],
         [value],
-        "*",
+        marker,
         label=label,
         color=color,
         markersize=17,

@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
 from ..model.arch import Arch, Precision
 from ..model.files import read_json
@@ -131,11 +137,12 @@ class Found(_Frozen):
     verified: Verified | None = None
     """Where the front was timed."""
 
-    def to_json(self) -> dict[str, Any]:
-        """As it stands in front.json; a search that measured nothing tells no cost of it."""
-        told = self.model_dump(mode="json", by_alias=True)
+    @model_serializer(mode="wrap")
+    def _told(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A search that measured nothing tells no cost of it."""
+        told: dict[str, Any] = handler(self)
         optional = ("cost", "verified")
-        return {name: each for name, each in told.items() if each or name not in optional}
+        return {name: each for name, each in told.items() if name not in optional or each}
 
 
 def read(path: Path) -> Found:

@@ -327,7 +327,8 @@ def _mixtures(known: Floats) -> Floats:
     if not told.size or len(known) == 1:
         return np.eye(len(known))
     scales = 1 / np.maximum(np.ptp(told, axis=1), 1e-9)
-    return np.concatenate([np.eye(len(known)), np.ones((1, len(known)))]) * scales
+    weights: Floats = np.concatenate([np.eye(len(known)), np.ones((1, len(known)))]) * scales
+    return weights
 
 
 def _mixed(weights: Floats, losses: Floats) -> Floats:

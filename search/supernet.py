@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 from pydantic import BaseModel, ConfigDict
 
 from ..model.box import in_box, named_model, names
-from ..model.data.catalog import DATASETS, STREETS, open_dataset
-from ..model.data.scene import Sample
 from ..model.errors import UsageError
 from ..model.files import read_json
 from .accuracy import Metric
 from .result import Task
 
 if TYPE_CHECKING:
+    from ..model.data.catalog import Dataset
+    from ..model.data.scene import Sample
     from .inherited import Inherited
 
 HEADER_AT: Final = 8
@@ -89,11 +89,11 @@ class Source:
 
     def training(self) -> Sequence[Sample]:
         """What the norms take their statistics from."""
-        return self._opened(DATASETS[self._name].trained)
+        return self._opened(self._row.trained)
 
     def judging(self) -> Sequence[Sample]:
         """What judges, apart from what trains where the data set has such a part."""
-        row = DATASETS[self._name]
+        row = self._row
         return self._opened(self.split or ("val" if "val" in row.splits else row.judged))
 
     def metrics(self, objective: Metric, task: Task) -> tuple[Metric, ...]:
@@ -110,13 +110,26 @@ class Source:
         return tuple(dict.fromkeys((objective, "miou") if both else (objective,)))
 
     @property
+    def _row(self) -> Dataset:
+        from ..model.data.catalog import DATASETS
+
+        if self._name not in DATASETS:
+            raise UsageError(f"--dataset must be one of {', '.join(DATASETS)}, not {self._name}")
+        return DATASETS[self._name]
+
+    @property
     def _name(self) -> str:
+        from ..model.data.catalog import STREETS
+
         if str(self.data) == STREETS:
             return STREETS
         return self.dataset or ("folder" if (self.data / "left").is_dir() else "kitti2015")
 
     def _opened(self, split: str) -> Sequence[Sample]:
+        from ..model.data.catalog import STREETS, open_dataset
+
         if self._name == STREETS:
             return open_dataset(STREETS, split=split, size=self.size)
-        whole = self.split == "all" and split in DATASETS[self._name].splits
+        # A folder of a few frames has no written split: whoever judges on all calibrates on all.
+        whole = self.split == "all" and split in self._row.splits
         return open_dataset(self._name, self.data, "all" if whole else split)

@@ -51,7 +51,7 @@ def verified(
 
 def require_here(profile: Profile) -> None:
     """Raises `UsageError` unless the profile is of the machine at hand."""
-    told = ["it is of no machine that rts2 timed"]
+    told = ["its profile is of no machine"]
     if profile.machine is not None:
         told = elsewhere(profile.machine, cores())
     if told:

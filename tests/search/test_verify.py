@@ -1,0 +1,98 @@
+"""The front timed on the device: predictions give way, and a pick that misses is demoted."""
+
+from dataclasses import replace
+
+import pytest
+
+from rts2.model.arch import Arch
+from rts2.model.errors import UsageError
+from rts2.model.rts2net import RTS2Net
+from rts2.profiles.profile import Profile, load
+from rts2.profiles.timing import Timing
+from rts2.search.accuracy import Measured, MeasuredRows
+from rts2.search.exhaustive import Question, search
+from rts2.search.plot import draw
+from rts2.search.report import _cost
+from rts2.search.result import Found, Point
+from rts2.search.verify import verified
+
+from .standin import standin_row
+
+SLOWER = 1.5
+
+
+def asked(profile: Profile) -> tuple[Question, Found]:
+    """A front of which the pick just meets its target, by prediction."""
+    rows = tuple(standin_row(Arch(c=c)) for c in (2, 4, 8, 16))
+    table = Measured(MeasuredRows(schema="rts2.accuracy/1", rows=rows))
+    first = search(Question(profile, 1.0), table)
+    target = sorted(point.fps for point in first.front)[1] / 1.01
+    question = Question(profile, target)
+    return question, search(question, table)
+
+
+def no_network(arch: Arch) -> RTS2Net:
+    raise AssertionError(f"{arch.label()} is not needed by a clock that is made up")
+
+
+def taking(factor: float, point: Point) -> Timing:
+    """A quiet machine on which the reference takes 10 ms, and the point `factor` its prediction."""
+    return Timing((factor * point.latency_ms,) * 20, (10.0,) * 21, 10.0)
+
+
+def test_a_pick_that_misses_its_target_is_demoted(by_parts: Profile) -> None:
+    question, found = asked(by_parts)
+    told = verified(found, question, no_network, lambda point: taking(SLOWER, point))
+    assert found.selected is not None
+    assert told.verified is not None
+    assert told.verified.timed == len(found.front) == len(told.front)
+    assert told.verified.demoted is not None
+    assert told.verified.demoted.arch == found.selected.arch
+    assert told.verified.demoted.fps == pytest.approx(found.selected.fps / SLOWER)
+    assert told.selected is not None
+    assert told.selected.fps >= question.target_fps
+    assert told.selected.arch.c < found.selected.arch.c
+    assert {point.evidence.latency for point in told.front} == {"measured"}
+    labels = [label for label, _ in _cost(told)]
+    assert labels == ["verified", "demoted"]
+    legend = draw(told, "a CPU").axes[0].get_legend()
+    assert legend is not None
+    assert any("demoted, misses" in text.get_text() for text in legend.get_texts())
+
+
+def test_what_holds_stays_the_pick_and_what_cannot_be_timed_keeps_its_prediction(
+    by_parts: Profile,
+) -> None:
+    question, found = asked(by_parts)
+    assert found.selected is not None
+    pick = found.selected
+    told = verified(
+        found, question, no_network, lambda point: taking(1.0, point) if point == pick else None
+    )
+    assert told.verified is not None
+    assert (told.verified.timed, told.verified.demoted) == (1, None)
+    assert told.verified.predicted == len(found.front) - 1
+    assert told.selected is not None
+    assert told.selected.arch == pick.arch
+    assert told.selected.evidence.latency == "measured"
+    others = [point for point in told.front if point.arch != pick.arch]
+    assert all(point in found.front for point in others)
+
+
+def test_only_the_device_itself_verifies(by_parts: Profile) -> None:
+    question, found = asked(by_parts)
+    with pytest.raises(UsageError, match="Jetson TX2 is not this machine"):
+        verified(found, replace(question, profile=load("tx2")), no_network)
+    assert by_parts.machine is not None
+    other = by_parts.machine.model_copy(update={"processor": "another"})
+    elsewhere = by_parts.model_copy(update={"machine": other})
+    with pytest.raises(UsageError, match="the profile is of another; this is"):
+        verified(found, replace(question, profile=elsewhere), no_network)
+
+
+def test_every_point_is_one_of_the_same_question_again(by_parts: Profile) -> None:
+    """What was written is read again, with what was timed."""
+    question, found = asked(by_parts)
+    told = verified(found, question, no_network, lambda point: taking(SLOWER, point))
+    assert Found.model_validate(told.model_dump(mode="json", by_alias=True)) == told
+    assert "verified" not in found.model_dump()
