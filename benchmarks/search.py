@@ -28,9 +28,9 @@ def command_s() -> float:
 def in_process_s() -> tuple[float, float, int]:
     """The search alone and its picture alone, imports excluded; and how many candidates."""
     from rts2.profiles.profile import load
-    from rts2.search.accuracy import source
     from rts2.search.exhaustive import Question, search
     from rts2.search.plot import save
+    from rts2.search.sources import source
 
     question, known = Question(load("tx2"), 10.0), source("published")
     search(question, known)

@@ -26,10 +26,11 @@ from optuna.samplers import BaseSampler, NSGAIISampler, RandomSampler, TPESample
 from rts2.model.arch import LARGEST, Arch
 from rts2.model.files import read_json
 from rts2.profiles.profile import load
-from rts2.search.accuracy import MeasuredRows, Row
+from rts2.search.accuracy import Row
 from rts2.search.exhaustive import Question
 from rts2.search.landscape import Chains, Landscape
 from rts2.search.sampler import FrontSampler, as_stored
+from rts2.search.sources import MeasuredRows
 from rts2.search.space import Space
 
 SEEDS = 5

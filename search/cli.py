@@ -31,12 +31,12 @@ from ..model.files import output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
 from ..profiles.here import differences
 from ..profiles.profile import Profile, Runtime, load, names
-from .accuracy import source
 from .deploy.cli import deploy
 from .deploy.configuration import of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
 from .result import Cost, Found, Task
+from .sources import source
 from .supernet import supernet
 
 if TYPE_CHECKING:

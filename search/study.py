@@ -27,12 +27,13 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from ..model.arch import Arch
 from ..model.console import one_line
 from ..model.errors import NothingFeasible, Rts2Error
-from .accuracy import LOWER_IS_BETTER, Measured, MeasuredRows, Metric, Row, source
+from .accuracy import LOWER_IS_BETTER, Metric, Row
 from .exhaustive import Question
 from .exhaustive import search as search_all
 from .landscape import Chains, Landscape
 from .result import Found
 from .sampler import REASON, ROWS, FrontSampler, as_stored
+from .sources import Measured, MeasuredRows, source
 from .space import Space
 from .storage import opened, reached, without_password
 

@@ -19,10 +19,11 @@ from rts2.model.ops import ops, padded
 from rts2.profiles.conformal import half_width
 from rts2.profiles.latency import LatencyModel, predict_ms
 from rts2.profiles.profile import Profile, load
-from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, AccuracySource, source
+from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, AccuracySource
 from rts2.search.exhaustive import EVIDENCE, Question, _Block, _executors, _Totals, search
 from rts2.search.lowered import Lowered, LoweredRows, Row
 from rts2.search.result import Found
+from rts2.search.sources import source
 from rts2.search.space import Space
 
 BRANCHES = ("disparity", "disparity+semantic", "full")

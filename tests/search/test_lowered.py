@@ -7,8 +7,9 @@ from rts2.model.arch import Arch
 from rts2.model.errors import Rts2Error
 from rts2.model.files import parse_json
 from rts2.profiles.evidence import BRANCHES
-from rts2.search.accuracy import METRICS, source
+from rts2.search.accuracy import METRICS
 from rts2.search.lowered import Lowered, LoweredRows, Row, measured
+from rts2.search.sources import source
 from rts2.search.space import Space
 
 SPACE = Space(c=(1, 2, 4, 16), d_max=(12, 24), conv3d=((16,), (4,), (4,)))

@@ -10,11 +10,11 @@ from PIL import Image
 
 from rts2.model.errors import Rts2Error
 from rts2.profiles.profile import Profile, load
-from rts2.search.accuracy import source
 from rts2.search.exhaustive import Question, search
 from rts2.search.plot import MARKERS, draw, save
 from rts2.search.report import executor_of
 from rts2.search.result import Found
+from rts2.search.sources import source
 from rts2.search.space import Space
 
 SMALL = Space(c=(1, 4, 8, 16), d_max=(10, 12), conv3d=((16,), (4,), (4,)))

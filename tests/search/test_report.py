@@ -11,10 +11,11 @@ from rich.console import Console
 from rts2.model.arch import Arch
 from rts2.model.console import WIDTH
 from rts2.profiles.profile import Profile, load
-from rts2.search.accuracy import METRICS, Metric, source
+from rts2.search.accuracy import METRICS, Metric
 from rts2.search.exhaustive import Question, search
 from rts2.search.report import ROWS, as_csv, caption, headline, name_of, number, show
 from rts2.search.result import Found, Point
+from rts2.search.sources import source
 
 
 @cache

@@ -13,8 +13,8 @@ from rts2.model.ops import Op, ops
 from rts2.profiles.evidence import BRANCHES, Box, boxes
 from rts2.profiles.latency import latencies_ms, predict_ms
 from rts2.profiles.profile import load
-from rts2.search.accuracy import source
 from rts2.search.exhaustive import Question, search
+from rts2.search.sources import source
 from rts2.search.space import Parts, Space
 
 SMALL = Space(

@@ -9,8 +9,8 @@ import pytest
 from optuna.trial import TrialState
 
 from rts2.model.errors import NothingFeasible, Rts2Error, UsageError
-from rts2.search.accuracy import Measured, MeasuredRows
 from rts2.search.exhaustive import search
+from rts2.search.sources import Measured, MeasuredRows
 from rts2.search.space import Space
 from rts2.search.storage import reached, sqlite, without_password
 from rts2.search.study import Order, Progress, Studied, Work, found_by, name_of, run

@@ -9,11 +9,11 @@ from rts2.model.errors import UsageError
 from rts2.model.rts2net import RTS2Net
 from rts2.profiles.profile import Profile, load
 from rts2.profiles.timing import Timing
-from rts2.search.accuracy import Measured, MeasuredRows
 from rts2.search.exhaustive import Question, search
 from rts2.search.plot import draw
 from rts2.search.report import _cost
 from rts2.search.result import Found, Point
+from rts2.search.sources import Measured, MeasuredRows
 from rts2.search.verify import verified
 
 from .standin import standin_row

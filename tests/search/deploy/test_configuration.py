@@ -9,11 +9,11 @@ from rts2.model.arch import MEAN, STD, Arch
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.profiles.parts import PartModel
 from rts2.profiles.profile import load
-from rts2.search.accuracy import source
 from rts2.search.deploy.configuration import describe, of_arch, of_point, read
 from rts2.search.deploy.schema import Deployment, json_schema
 from rts2.search.exhaustive import Question, search
 from rts2.search.result import Found
+from rts2.search.sources import source
 from rts2.search.space import Space
 
 

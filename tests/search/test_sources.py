@@ -11,16 +11,8 @@ from numpy.typing import NDArray
 
 from rts2.model.arch import Arch
 from rts2.model.errors import Rts2Error, UsageError
-from rts2.search.accuracy import (
-    LOWER_IS_BETTER,
-    METRICS,
-    Accuracy,
-    Disparities,
-    Measured,
-    Metric,
-    Published,
-    source,
-)
+from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, Accuracy, Metric
+from rts2.search.sources import Disparities, Measured, Published, source
 from rts2.search.space import Space
 
 PLAIN, SEMANTIC, FULL = 0, 1, 2
