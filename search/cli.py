@@ -130,7 +130,9 @@ def _measured(options: argparse.Namespace, question: Question, weights: Path) ->
     )
     own = judge.open()
     if options.verify:
-        found = verified(found, question, own.network)
+        from .tried import Trials
+
+        found = verified(found, question, Trials(question, own))
     if found.selected is not None:
         from ..model.checkpoint import save
 
@@ -240,7 +242,7 @@ def _add_study(described: argparse.ArgumentParser) -> None:
         "postgresql://… (default: study.db in --out)"
     )
     add("--storage", metavar="URL", help=text)
-    text = "times every point of the front on this device, where it is the device"
+    text = "times and judges every point of the front here, where this machine is the device"
     add("--verify", action="store_true", help=text)
 
 

@@ -88,8 +88,8 @@ class Inherited:
         self.path, self.arch, self.origin = path, network.arch, header.origin
         self._network = network
         self._training = [sample.read() for sample in data.training]
-        self._judging = [sample.read() for sample in data.judging]
-        _require_labels(self._judging)
+        self.data, self.judging = data, [sample.read() for sample in data.judging]
+        _require_labels(self.judging)
         self._folder = folder / self.digest[:16]
         self._rows: dict[Arch, Row] = {}
         self.evaluations = self.hits = 0
@@ -100,7 +100,7 @@ class Inherited:
     def digest(self) -> str:
         """The SHA-256 of the supernet's weights and of every image that its figures rest on."""
         found = hashlib.sha256(sha256(self.path).encode())
-        for scene in (*self._training, *self._judging):
+        for scene in (*self._training, *self.judging):
             for name, array in sorted(scene.arrays().items()):
                 found.update(f"{name} {array.dtype} {array.shape}".encode())
                 found.update(np.ascontiguousarray(array).tobytes())
@@ -158,10 +158,10 @@ class Inherited:
         network = self.network(arch)
         held = _held(arch)
         totals = dict.fromkeys(held, Score())
-        for scene in self._judging:
+        for scene in self.judging:
             for key, found in _scores(network, scene):
                 totals[key] += found
-        source = f"inherited, {self.origin}; judged on {len(self._judging)} images"
+        source = f"inherited, {self.origin}; judged on {len(self.judging)} images"
         for key, part in held.items():
             yield _row(part, totals[key], source)
 

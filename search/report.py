@@ -218,7 +218,7 @@ def _cost(found: Found) -> list[tuple[str, str]]:
     """What measuring took, and what timing changed."""
     lines = []
     if (seen := found.verified) is not None:
-        told = f"{seen.timed} points timed on this device"
+        told = f"{seen.timed} points measured on this device"
         if seen.predicted:
             told += f", {seen.predicted} could not be, and keep their predictions"
         lines.append(("verified", told))

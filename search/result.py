@@ -105,11 +105,11 @@ class Cost(_Frozen):
 
 
 class Verified(_Frozen):
-    """What was timed again on the device itself."""
+    """What was tried on the device itself."""
 
     timed: Count
     predicted: Count
-    """Points that could not be timed here, and keep their predictions."""
+    """Points that could not be tried here, and keep their predictions."""
     demoted: Point | None
     """The pick by prediction, as timed, where it misses the target."""
 

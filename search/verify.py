@@ -1,4 +1,4 @@
-"""The front held against the device itself: predictions give way to timings."""
+"""The front held against the device itself: predictions give way to measurements."""
 
 from __future__ import annotations
 
@@ -9,36 +9,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..model.arch import Arch
+from ..model.console import progress
 from ..model.errors import UsageError
 from ..model.machine import cores
 from ..profiles.here import elsewhere
 from ..profiles.profile import Profile
-from .accuracy import LOWER_IS_BETTER
+from .accuracy import LOWER_IS_BETTER, METRICS
 from .exhaustive import Question, choices
 from .front import nondominated
 from .result import Found, Point, Verified
 
 if TYPE_CHECKING:
-    from ..model.rts2net import RTS2Net
-    from ..profiles.timing import Timing
+    from ..model.metrics import Score
+    from .tried import Tried
 
-Clock = Callable[[Point], "Timing | None"]
-"""Times one point; None where this machine cannot run it as it is meant."""
+Trying = Callable[[Point], "Tried | None"]
+"""Tries one point; None where this machine cannot run it as it is meant."""
 
 
-def verified(
-    found: Found, question: Question, network: Callable[[Arch], RTS2Net], clock: Clock | None = None
-) -> Found:
-    """The same front with every point timed that can be, and the pick chosen anew.
+def verified(found: Found, question: Question, trying: Trying) -> Found:
+    """The same front with every point timed and judged that can be, and the pick chosen anew.
 
-    `network` gives a point's weights. What another point beats once timed leaves the front; a pick
-    that misses its target is told as demoted. Raises `UsageError` where this machine is not the
-    device.
+    What another point beats once tried leaves the front; a pick that misses its target is told as
+    demoted. Raises `UsageError` where this machine is not the device.
     """
     require_here(question.profile)
-    clock = clock or timed_here(question, network)
-    front = list(_timed(found, clock))
+    front = list(_tried(found, trying))
     timed = sum(point.evidence.latency == "measured" for point in front)
     chosen = choices(question, _kept(front, found))
     again = next((p for p in front if found.selected and _same(p, found.selected)), None)
@@ -61,47 +57,32 @@ def require_here(profile: Profile) -> None:
         )
 
 
-def timed_here(question: Question, network: Callable[[Arch], RTS2Net]) -> Clock:
-    """Times points on this machine, as its profile was timed."""
-    from ..model.checkpoint import build
-    from ..profiles import timing
-    from ..profiles.measure import REFERENCE
-    from ..profiles.runtimes import Sized, open_session, precisions_of
-
-    arch, size = REFERENCE
-    threads = cores()
-    first = open_session("onnxruntime", Sized(build(arch), size), "fp32", threads)
-    reference = timing.Reference(first.run)
-
-    def timed(point: Point) -> timing.Timing | None:
-        sized = Sized(network(point.arch), question.resolution, point.arch.stages)
-        if point.precision not in precisions_of(point.runtime, sized):
-            return None
-        session = open_session(point.runtime, sized, point.precision, threads)
-        return timing.measure(session.run, reference)
-
-    return timed
-
-
-def _timed(found: Found, clock: Clock) -> Iterator[Point]:
-    """Every point, timed where the clock can."""
+def _tried(found: Found, trying: Trying) -> Iterator[Point]:
+    """Every point, measured where it can be."""
     doubt = NormalDist().inv_cdf((1 + found.confidence) / 2)
-    for point in found.front:
-        timing = clock(point)
-        if timing is None:
+    for point in progress(found.front, "verifying", len(found.front)):
+        tried = trying(point)
+        if tried is None:
             yield point
             continue
-        latency = timing.ratio * timing.own_ms
-        fps, half = 1000 / latency, doubt * timing.error
+        latency = tried.timing.ratio * tried.timing.own_ms
+        fps, half = 1000 / latency, doubt * tried.timing.error
+        judged = {} if tried.score is None else _figures(tried.score)
+        told = {"latency": "measured", **({"accuracy": "measured"} if judged else {})}
         yield point.model_copy(
             update={
                 "latency_ms": latency,
                 "fps": fps,
                 "fps_low": fps * exp(-half),
                 "fps_high": fps * exp(half),
-                "evidence": point.evidence.model_copy(update={"latency": "measured"}),
+                "evidence": point.evidence.model_copy(update=told),
+                **judged,
             }
         )
+
+
+def _figures(score: Score) -> dict[str, float | None]:
+    return {metric: getattr(score, metric) for metric in METRICS}
 
 
 def _kept(front: list[Point], found: Found) -> list[Point]:

@@ -9,7 +9,6 @@ from ...model.arch import Arch, Form, Precision
 from ...model.box import Figures
 from ...model.files import read_json, sha256
 from ...model.ops import padded
-from ...profiles.latency import fastest_forms
 from ...profiles.profile import Profile, Resolution, Runtime
 from ..result import Found
 from ..result import Point as FrontPoint
@@ -82,7 +81,7 @@ def of_arch(
         arch=arch,
         precision=precision,
         runtime=runtime,
-        forms=_forms(arch, profile, precision, runtime, resolution),
+        forms=forms_of(arch, profile, precision, runtime, resolution),
         input=Input(resolution=resolution, shape=(1, 3, height, width)),
         outputs=tuple(outputs),
         postprocessing=Postprocessing(crop=resolution, classes=_class_names(arch)),
@@ -93,7 +92,7 @@ def of_arch(
     )
 
 
-def _forms(
+def forms_of(
     arch: Arch, profile: Profile, precision: Precision, runtime: Runtime, resolution: Resolution
 ) -> tuple[Form, ...] | None:
     """The forms that the device runs fastest, as far as both were timed there."""

@@ -6,14 +6,15 @@ import pytest
 
 from rts2.model.arch import Arch
 from rts2.model.errors import UsageError
-from rts2.model.rts2net import RTS2Net
+from rts2.model.metrics import Errors, Score
 from rts2.profiles.profile import Profile, load
 from rts2.profiles.timing import Timing
 from rts2.search.exhaustive import Question, search
 from rts2.search.plot import draw
 from rts2.search.report import _cost
-from rts2.search.result import Found, Point
+from rts2.search.result import Found, Point, PointEvidence
 from rts2.search.sources import Measured, MeasuredRows
+from rts2.search.tried import Tried
 from rts2.search.verify import verified
 
 from .standin import standin_row
@@ -31,18 +32,14 @@ def asked(profile: Profile) -> tuple[Question, Found]:
     return question, search(question, table)
 
 
-def no_network(arch: Arch) -> RTS2Net:
-    raise AssertionError(f"{arch.label()} is not needed by a clock that is made up")
-
-
-def taking(factor: float, point: Point) -> Timing:
+def taking(factor: float, point: Point, score: Score | None = None) -> Tried:
     """A quiet machine on which the reference takes 10 ms, and the point `factor` its prediction."""
-    return Timing((factor * point.latency_ms,) * 20, (10.0,) * 21, 10.0)
+    return Tried(Timing((factor * point.latency_ms,) * 20, (10.0,) * 21, 10.0), score)
 
 
 def test_a_pick_that_misses_its_target_is_demoted(by_parts: Profile) -> None:
     question, found = asked(by_parts)
-    told = verified(found, question, no_network, lambda point: taking(SLOWER, point))
+    told = verified(found, question, lambda point: taking(SLOWER, point))
     assert found.selected is not None
     assert told.verified is not None
     assert told.verified.timed == len(found.front) == len(told.front)
@@ -66,9 +63,7 @@ def test_what_holds_stays_the_pick_and_what_cannot_be_timed_keeps_its_prediction
     question, found = asked(by_parts)
     assert found.selected is not None
     pick = found.selected
-    told = verified(
-        found, question, no_network, lambda point: taking(1.0, point) if point == pick else None
-    )
+    told = verified(found, question, lambda point: taking(1.0, point) if point == pick else None)
     assert told.verified is not None
     assert (told.verified.timed, told.verified.demoted) == (1, None)
     assert told.verified.predicted == len(found.front) - 1
@@ -79,20 +74,33 @@ def test_what_holds_stays_the_pick_and_what_cannot_be_timed_keeps_its_prediction
     assert all(point in found.front for point in others)
 
 
+def never(point: Point) -> Tried:
+    raise AssertionError(f"{point.arch.label()} is tried elsewhere than on the device")
+
+
+def test_what_a_precision_says_is_judged_anew(by_parts: Profile) -> None:
+    question, found = asked(by_parts)
+    worse = Score(everything=Errors(pixels=1000, outliers=180, total_px=2500.0))
+    told = verified(found, question, lambda point: taking(1.0, point, worse))
+    assert told.selected is not None
+    assert (told.selected.d1_all, told.selected.epe, told.selected.miou) == (18.0, 2.5, None)
+    assert told.selected.evidence == PointEvidence(latency="measured", accuracy="measured")
+
+
 def test_only_the_device_itself_verifies(by_parts: Profile) -> None:
     question, found = asked(by_parts)
     with pytest.raises(UsageError, match="Jetson TX2 is not this machine"):
-        verified(found, replace(question, profile=load("tx2")), no_network)
+        verified(found, replace(question, profile=load("tx2")), never)
     assert by_parts.machine is not None
     other = by_parts.machine.model_copy(update={"processor": "another"})
     elsewhere = by_parts.model_copy(update={"machine": other})
     with pytest.raises(UsageError, match="the profile is of another; this is"):
-        verified(found, replace(question, profile=elsewhere), no_network)
+        verified(found, replace(question, profile=elsewhere), never)
 
 
 def test_every_point_is_one_of_the_same_question_again(by_parts: Profile) -> None:
     """What was written is read again, with what was timed."""
     question, found = asked(by_parts)
-    told = verified(found, question, no_network, lambda point: taking(SLOWER, point))
+    told = verified(found, question, lambda point: taking(SLOWER, point))
     assert Found.model_validate(told.model_dump(mode="json", by_alias=True)) == told
     assert "verified" not in found.model_dump()
