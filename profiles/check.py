@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import exp, log
 from typing import Any
 
-from ..model.arch import Arch, Precision
+from ..model.arch import Arch, Form, Precision
+from ..model.console import progress
 from ..model.errors import Rts2Error
 from .calibrate import summary
 from .conformal import half_width
@@ -16,6 +17,7 @@ from .latency import fastest_forms, predict_ms
 from .measure import Bench
 from .plan import Job, random_candidate
 from .profile import Profile, Resolution, Runtime
+from .timing import Timing
 
 CHECK_SEED = 1_000_003
 """Fresh networks are drawn from another stream than those that a fit is made of."""
@@ -124,35 +126,38 @@ def fresh(
     executors: Sequence[Executor],
     samples: int,
     seed: int,
-) -> Iterator[Comparison]:
+) -> list[Comparison]:
     """Random networks that no fit has seen, timed on this machine now, each in one of `executors`;
-    those whose timing is unreliable come last, timed again.
+    those whose timing is unreliable are timed again, after all others.
 
-    What counts is the ratio to the reference beside it: a machine drifts from day to day.
+    What counts is the ratio to the reference beside it: a machine drifts from day to day. Whether
+    it was quiet is told in hindsight: the first timings know of no faster reference than their own.
     """
     chance = random.Random(CHECK_SEED + seed)
-    drawn: list[tuple[Runtime, Job]] = []
+    drawn: list[tuple[Bench, Job]] = []
     for _ in range(samples):
         candidate = random_candidate(chance)
         runtime, precision = chance.choice(executors)
-        drawn.append((runtime, Job(*candidate, precision)))
-    for left in range(RETRIES, -1, -1):
-        again = []
-        for runtime, job in drawn:
-            found = _compared(profile, benches(runtime), job)
-            if found.reliable or not left:
-                yield found
-            else:
-                again.append((runtime, job))
-        drawn = again
+        bench, job = benches(runtime), Job(*candidate, precision)
+        drawn.append((bench, replace(job, forms=_forms(profile, bench, job))))
+    found: dict[int, Timing] = {}
+    for _ in range(1 + RETRIES):
+        left = [at for at in range(samples) if at not in found or not found[at].reliable]
+        for at in progress(left, "timing", len(left)):
+            bench, job = drawn[at]
+            found[at] = bench.time(job)
+        found = {at: timing.beside(drawn[at][0].own_ms) for at, timing in found.items()}
+    return [_compared(profile, *drawn[at], found[at]) for at in range(samples)]
 
 
-def _compared(profile: Profile, bench: Bench, job: Job) -> Comparison:
-    """One network in its fastest form, timed now."""
+def _forms(profile: Profile, bench: Bench, job: Job) -> tuple[Form, ...] | None:
     known = profile.calibration(bench.runtime, job.precision)
-    forms = fastest_forms(known.model, job.arch, job.resolution)
-    job = replace(job, forms=forms)
-    timing = bench.time(job)
+    return fastest_forms(known.model, job.arch, job.resolution)
+
+
+def _compared(profile: Profile, bench: Bench, job: Job, timing: Timing) -> Comparison:
+    """One network in its fastest form, as it was timed now."""
+    known = profile.calibration(bench.runtime, job.precision)
     then = (profile.machine and profile.machine.reference_ms) or timing.reference_ms
     return Comparison(
         job.arch,

@@ -264,8 +264,7 @@ def _timed_now(
     executors, skipped = executors_here(known, benches)
     for reason in skipped:
         _warn(f"not timed: {reason}")
-    timed = fresh(known, benches, executors, options.samples, options.seed)
-    comparisons = list(progress(timed, "timing", options.samples))
+    comparisons = fresh(known, benches, executors, options.samples, options.seed)
     reliable = [comparison for comparison in comparisons if comparison.reliable]
     result = report(known, comparisons)
     return comparisons, result | {"coverage": coverage(known, reliable, CONFIDENCE)}
@@ -393,7 +392,7 @@ def _fit(options: argparse.Namespace) -> None:
 def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Profile:
     """Times networks until the budget is spent, going on where an earlier run stopped."""
     from ..model.machine import cores
-    from .measure import Bench, extend, journal_path, open_journal, profile_of
+    from .measure import Bench, extend, in_hindsight, journal_path, open_journal, profile_of
     from .plan import jobs
 
     deadline = monotonic() + options.budget - RESERVE_S
@@ -402,9 +401,11 @@ def _fit_here(options: argparse.Namespace, template: Profile, path: Path) -> Pro
     journal = open_journal(timings, options.runtime, threads, options.seed)
     beside = _beside(template, options.runtime, threads)
     bench = Bench(options.runtime, threads)
-    remaining = islice(jobs(options.seed, bench.precisions), len(journal.samples), None)
-    for job in _until(deadline, remaining, len(journal.samples)):
+    before = len(journal.samples)
+    remaining = islice(jobs(options.seed, bench.precisions), before, None)
+    for job in _until(deadline, remaining, before):
         journal = extend(journal, timings, bench.harvest(job))
+    journal = in_hindsight(journal, timings, before, bench.own_ms)
     busy = sum(not sample.reliable for sample in journal.samples)
     if busy > BUSY_SHARE * len(journal.samples):
         _warn(

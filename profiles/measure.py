@@ -6,7 +6,7 @@ import random
 import weakref
 from collections.abc import Sequence
 from functools import cached_property
-from math import exp, log
+from math import exp, hypot, log
 from pathlib import Path
 from shutil import rmtree
 from statistics import median
@@ -36,7 +36,7 @@ from .profile import (
     Runtime,
 )
 from .several import FITTED, blank, precision_support, runtime_support, titled
-from .timing import Reference, Timing, measure
+from .timing import BUSY_ERROR, MAX_ERROR, QUIET, Reference, Timing, measure
 
 if TYPE_CHECKING:
     from .runtimes import Session
@@ -141,6 +141,11 @@ class Bench:
         path = self._exported(*REFERENCE, "reference")
         return Reference(open_session("onnxruntime", path, "fp32", self.threads).run)
 
+    @property
+    def own_ms(self) -> float:
+        """What the reference takes while the machine is quiet, as far as it is known by now."""
+        return self._reference.own_ms
+
     def time(self, job: Job) -> Timing:
         """One network as a whole, as carefully as can be."""
         return measure(self._opened(self._graph(job), job.precision).run, self._reference)
@@ -227,9 +232,29 @@ def open_journal(path: Path, runtime: Runtime, threads: int, seed: int) -> Journ
 
 def extend(journal: Journal, path: Path, sample: Sample) -> Journal:
     """One more sample, written down."""
-    longer = journal.model_copy(update={"samples": (*journal.samples, sample)})
-    write_json(path, longer.model_dump(mode="json", by_alias=True))
-    return longer
+    return _written(journal, path, (*journal.samples, sample))
+
+
+def in_hindsight(journal: Journal, path: Path, since: int, own_ms: float) -> Journal:
+    """The samples from `since` on, of one run, judged by what the reference turned out to take
+    while the machine was quiet: the first ones knew of no faster reference than their own.
+    """
+    before, own = journal.samples[:since], journal.samples[since:]
+    slow = [sample.reliable and sample.reference_ms > QUIET * own_ms for sample in own]
+    judged = [_doubted(s) if busy else s for s, busy in zip(own, slow, strict=True)]
+    return _written(journal, path, (*before, *judged)) if any(slow) else journal
+
+
+def _doubted(sample: Sample) -> Sample:
+    """A sample of a busy machine."""
+    error = hypot(sample.error, BUSY_ERROR)
+    return sample.model_copy(update={"reliable": error <= MAX_ERROR, "error": error})
+
+
+def _written(journal: Journal, path: Path, samples: Sequence[Sample]) -> Journal:
+    changed = journal.model_copy(update={"samples": tuple(samples)})
+    write_json(path, changed.model_dump(mode="json", by_alias=True))
+    return changed
 
 
 def profile_of(

@@ -9,7 +9,7 @@ one of few large ones, so that no ratio cancels what others take; waiting until 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from math import hypot, inf, sqrt
@@ -87,6 +87,10 @@ class Timing:
     """The reference before the first run, between the runs, and after the last."""
     own_ms: float
     """What the reference takes on this machine while it is quiet."""
+
+    def beside(self, own_ms: float) -> Timing:
+        """The same runs, where the reference has turned out to take `own_ms` while it is quiet."""
+        return replace(self, own_ms=own_ms)
 
     @property
     def median_ms(self) -> float:

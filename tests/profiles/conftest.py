@@ -77,6 +77,11 @@ class Planted(Bench):
         own = reference / (2 if self.busy else 1)
         return Timing(tuple(map(float, times)), (reference,) * 12, own)
 
+    @property
+    def own_ms(self) -> float:
+        """At the speed of the latest timing."""
+        return self.drift * REFERENCE_MS / (2 if self.busy else 1)
+
     def harvest(self, job: Job) -> Sample:
         timing = self.time(job)
         found = parts(ops(job.arch, job.resolution), job.forms)

@@ -14,15 +14,25 @@ from hypothesis import strategies as st
 
 from rts2.model.arch import SPACE_C, SPACE_CONV3D, SPACE_D_MAX, Arch, Precision
 from rts2.model.errors import Rts2Error
+from rts2.model.files import read_json
 from rts2.model.ops import ops
 from rts2.profiles import measure, timing
 from rts2.profiles.here import this_machine
 from rts2.profiles.latency import predict_ms
-from rts2.profiles.measure import NEEDED, Bench, Journal, extend, open_journal, profile_of
+from rts2.profiles.measure import (
+    NEEDED,
+    Bench,
+    Journal,
+    extend,
+    in_hindsight,
+    open_journal,
+    profile_of,
+)
 from rts2.profiles.parts import PartModel, parts
 from rts2.profiles.plan import RESOLUTIONS, Job, jobs, random_candidate
 from rts2.profiles.profile import Profile, load
 from rts2.profiles.several import OURS
+from rts2.profiles.timing import BUSY_ERROR
 from rts2.search.space import Space
 
 FIRST = 64
@@ -293,6 +303,21 @@ def test_unreliable_timings_are_left_out(planted: Any) -> None:
     assert len(found.points) == 27
     assert "27 whole networks, 3 more were worth nothing" in found.calibrations[0].source
     assert "more" not in expected.calibrations[0].source
+
+
+def test_timings_beside_a_reference_that_was_slow_are_doubted_in_hindsight(
+    planted: Any, tmp_path: Path
+) -> None:
+    """Those of this run: what another day's reference took tells nothing of today."""
+    bench = planted()
+    journal, path = bench.journal(30, drifts=[1.33, 1.33, 1.33, 1.1]), tmp_path / "journal.json"
+    assert all(sample.reliable for sample in journal.samples)
+    seen = in_hindsight(journal, path, 1, bench.own_ms)
+    assert [index for index, s in enumerate(seen.samples) if not s.reliable] == [1, 2]
+    errors = [sample.error for sample in seen.samples[:4]]
+    assert errors == pytest.approx([0.0, BUSY_ERROR, BUSY_ERROR, 0.0])
+    assert read_json(path, Journal, "a journal") == seen
+    assert in_hindsight(seen, path, 3, bench.own_ms) is seen
 
 
 def test_too_few_reliable_timings_name_the_remedy(planted: Any) -> None:
