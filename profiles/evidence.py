@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..model.arch import Arch, Branches
@@ -42,6 +42,26 @@ def boxes(archs: Iterable[Arch]) -> dict[int, Box]:
         stages: _box([arch for arch in known if arch.stages == stages])
         for stages in sorted({arch.stages for arch in known})
     }
+
+
+def part_boxes(archs: Iterable[Arch]) -> dict[int, Box]:
+    """The box of each stage count, where latencies are sums of parts: a stage takes what it takes
+    in every network that runs through it, and only the head is a stage count's own.
+    """
+    known = list(archs)
+    return {
+        stages: _with_heads(
+            _box([arch.up_to(stages) for arch in known if arch.stages >= stages]),
+            {arch.semantic for arch in known if arch.stages == stages},
+        )
+        for stages in sorted({arch.stages for arch in known})
+    }
+
+
+def _with_heads(box: Box, semantic: set[bool]) -> Box:
+    """The box less the variants whose head nobody timed."""
+    low, high = box.branches
+    return replace(box, branches=(low if False in semantic else 1, high if True in semantic else 0))
 
 
 def _box(archs: list[Arch]) -> Box:

@@ -22,7 +22,7 @@ from ..model.console import KITTI
 from ..model.errors import UsageError
 from ..model.ops import Size, padded
 from ..profiles.conformal import half_width
-from ..profiles.evidence import Evidence, boxes
+from ..profiles.evidence import Box, Evidence, boxes, part_boxes
 from ..profiles.latency import Floats, LatencyModel, latencies_ms
 from ..profiles.parts import PartModel
 from ..profiles.profile import Calibration, Profile, Resolution, Runtime
@@ -355,7 +355,7 @@ class _Block:
 
     def _latency(self) -> tuple[Floats, NDArray[np.int64]]:
         """Latencies, timings put in where there are any, and the evidence of each."""
-        box = boxes(timing.arch for timing in self._timings()).get(self.stages)
+        box = self._boxes().get(self.stages)
         if self.executor.derived or box is None or not self._resolution_known():
             return self.latency_ms, np.full(self.shape, EXTRAPOLATED)
         latency = self.latency_ms.copy()
@@ -404,7 +404,7 @@ class _Block:
         From the nearest arch that the calibration spans to the arch itself, to its resolution, to
         its executor. Widths of stages that only the calibrated block has are moved into its box.
         """
-        known = boxes(timing.arch for timing in self._timings())
+        known = self._boxes()
         stages = min(known, key=lambda count: (abs(count - self.stages), -count))
         resolution = min(
             {timing.resolution for timing in self._timings()},
@@ -424,6 +424,12 @@ class _Block:
                 self.latency_ms[own],
             ]
         )
+
+    def _boxes(self) -> dict[int, Box]:
+        """What was timed of each stage count."""
+        archs = (timing.arch for timing in self._timings())
+        by_parts = isinstance(self.executor.base.model, PartModel)
+        return part_boxes(archs) if by_parts else boxes(archs)
 
     def _timings(self) -> tuple[Timing, ...]:
         base = self.executor.base

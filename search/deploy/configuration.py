@@ -9,6 +9,7 @@ from ...model.arch import Arch, Form, Precision
 from ...model.box import Figures
 from ...model.files import read_json, sha256
 from ...model.ops import padded
+from ...profiles.latency import fastest_forms
 from ...profiles.profile import Profile, Resolution, Runtime
 from ..result import Found
 from ..result import Point as FrontPoint

@@ -5,7 +5,7 @@ from itertools import product
 import pytest
 
 from rts2.model.arch import Arch
-from rts2.profiles.evidence import BRANCHES, Box, boxes
+from rts2.profiles.evidence import BRANCHES, Box, boxes, part_boxes
 
 VARIANTS = {
     "disparity": {"semantic": False, "refinement": False},
@@ -36,6 +36,22 @@ def test_boxes_by_hand() -> None:
         2: Box(c=(2, 9), branches=(0, 2), d_max=(10, 14), conv3d=((8, 16), (4, 6))),
     }
     assert boxes([]) == {}
+
+
+def test_boxes_of_parts_by_hand() -> None:
+    """The one stage of the first network is a stage of the others too; its head is its own."""
+    known = [
+        arch(3, "disparity", 12, 16),
+        arch(4, "disparity+semantic", 12, 8, 4),
+        arch(9, "full", 14, 24, 6),
+    ]
+    assert part_boxes(known) == {
+        1: Box(c=(3, 9), branches=(0, 0), d_max=(12, 14), conv3d=((8, 24),)),
+        2: Box(c=(4, 9), branches=(1, 2), d_max=(12, 14), conv3d=((8, 24), (4, 6))),
+    }
+    whole = part_boxes([*known, arch(5, "full", 12, 16)])[1]
+    assert whole == Box(c=(3, 9), branches=(0, 2), d_max=(12, 14), conv3d=((8, 24),))
+    assert part_boxes([]) == {}
 
 
 def test_a_box_holds_the_points_that_span_it_and_what_lies_between() -> None:
