@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
@@ -28,6 +28,7 @@ from ..model.errors import Rts2Error, UsageError
 from ..model.evaluation import score
 from ..model.files import output_folder, read_json, sha256, write_json
 from ..model.metrics import Score
+from ..model.ops import padded
 from ..model.predictor import cut_back, enlarged, prepared
 from ..model.rts2net import RTS2Net, Stage
 from ..model.supernet import extract, outside, recalibrate
@@ -196,19 +197,25 @@ def _scores(network: RTS2Net, scene: Scene) -> Iterator[tuple[Key, Score]]:
     with torch.inference_mode():
         stages = network(*pair)
     for number, stage in enumerate(stages, 1):
-        for branches, part in _variants(stage).items():
-            disparity, semantic = enlarged(part, pair[0].shape[-2:])
-            estimate = cut_back(disparity, semantic, scene.left, 0.0, number)
-            yield (number, branches), score(estimate, scene, network.arch)
+        for branches, found in _variants(stage, scene, network.arch).items():
+            yield (number, branches), found
 
 
-def _variants(stage: Stage) -> dict[Branches, Stage]:
-    """What a stage says in networks of fewer branches."""
-    found: dict[Branches, Stage] = {"disparity": Stage(stage.disparity)}
+def _variants(stage: Stage, scene: Scene, arch: Arch) -> dict[Branches, Score]:
+    """What a stage scores in networks of fewer branches; each of its maps is judged once."""
+    size = padded(scene.size, arch.multiple)
+
+    def judged(part: Stage) -> Score:
+        disparity, semantic = enlarged(part, torch.Size(size))
+        return score(cut_back(disparity, semantic, scene.left, 0.0, None), scene, arch)
+
+    first = judged(Stage(stage.disparity, None, stage.scores))
+    found: dict[Branches, Score] = {"disparity": replace(first, labels=None, objects=None)}
     if stage.scores is not None:
-        found["disparity+semantic"] = Stage(stage.disparity, None, stage.scores)
+        found["disparity+semantic"] = first
     if stage.refined is not None:
-        found["full"] = stage
+        refined = judged(Stage(stage.refined))
+        found["full"] = replace(refined, labels=first.labels, objects=first.objects)
     return found
 
 

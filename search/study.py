@@ -234,7 +234,8 @@ class Work:
         self._storage.record_heartbeat(trial._trial_id)
         trial.set_user_attr(WORKER, _own_name())
         values = {
-            name: trial._suggest(name, axis) for name, axis in self.sampler.dimensions().items()
+            name: trial.suggest_categorical(name, axis)
+            for name, axis in self.sampler.chains.axes.items()
         }
         if not self._first_of(trial.number):
             raise optuna.TrialPruned

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -74,18 +75,13 @@ class Source:
     threads: int
 
     def open(self) -> Inherited:
-        """The judge, on so many threads.
+        """The judge, on so many threads; once in a process, as it holds its images.
 
         Raises:
             UsageError: no such data, or a checkpoint that is no supernet.
             Rts2Error: a file is broken.
         """
-        import torch
-
-        from .inherited import Data, Inherited
-
-        torch.set_num_threads(self.threads)
-        return Inherited(self.path, Data.of(self.training(), self.judging()), self.folder)
+        return _opened(self)
 
     def training(self) -> Sequence[Sample]:
         """What the norms take their statistics from."""
@@ -133,3 +129,13 @@ class Source:
         # A folder of a few frames has no written split: whoever judges on all calibrates on all.
         whole = self.split == "all" and split in self._row.splits
         return open_dataset(self._name, self.data, "all" if whole else split)
+
+
+@cache
+def _opened(source: Source) -> Inherited:
+    import torch
+
+    from .inherited import Data, Inherited
+
+    torch.set_num_threads(source.threads)
+    return Inherited(source.path, Data.of(source.training(), source.judging()), source.folder)
