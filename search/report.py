@@ -13,6 +13,7 @@ from rich.text import Text
 from ..profiles.evidence import Evidence
 from ..profiles.profile import Profile, Runtime
 from .accuracy import METRICS, Metric
+from .front import loss, pick
 from .result import Found, Point
 
 AXIS: dict[Metric, str] = {
@@ -196,7 +197,24 @@ def _verdict(found: Found) -> list[tuple[str, str]]:
             "what times it there; --allow-extrapolated takes it"
         )
         lines += [("prospect", told), ("", remedy)]
-    return lines
+    return [*lines, *_untried(found)]
+
+
+def _untried(found: Found) -> list[tuple[str, str]]:
+    """What 3D widths and planes that nobody trained could win, at latencies that are known."""
+    points = [p for p in found.front if p.ranges and p.evidence.latency != "extrapolated"]
+    best = pick(points, found.target_fps, found.objective, at_lower_bound=False)
+    if best is None or (
+        found.selected and loss(best, found.objective) >= loss(found.selected, found.objective)
+    ):
+        return []
+    low, high = (best.ranges or {}).get(found.objective, (0.0, 0.0))
+    between = f"{number(found.objective, low)}–{number(found.objective, high)}, extrapolated"
+    widths = "/".join(map(str, best.arch.conv3d))
+    shape = f"d_max {best.arch.d_max}, 3D {widths}"
+    told = f"{_sentence(found, best)} ({between}); {shape}"
+    remedy = "rts2-train --supernet, then --accuracy SUPERNET, measures it on your images"
+    return [("untried", told), ("", remedy)]
 
 
 def _sentence(found: Found, point: Point) -> str:
@@ -219,6 +237,8 @@ def _cost(found: Found) -> list[tuple[str, str]]:
     lines = []
     if (seen := found.verified) is not None:
         told = f"{seen.timed} points measured on this device"
+        if seen.unreliable:
+            told += f", {seen.unreliable} while it was busy, whose latencies stay predictions"
         if seen.predicted:
             told += f", {seen.predicted} could not be, and keep their predictions"
         lines.append(("verified", told))
@@ -268,15 +288,18 @@ def _notes(found: Found, profile: Profile) -> list[tuple[str, str]]:
 def as_csv(found: Found) -> str:
     """The front as a table for a spreadsheet, one line a point, by falling FPS."""
     text = io.StringIO()
-    names = [name for name in Point.model_fields if name not in ("arch", "evidence")]
+    names = [name for name in Point.model_fields if name not in ("arch", "evidence", "ranges")]
     arch = ["family", "c", "stages", "d_max", "conv3d", "branches"]
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*arch, *names, "latency_evidence", "accuracy_evidence", "selected"])
+    ends = [f"{metric}_{end}" for metric in METRICS for end in ("low", "high")]
+    writer.writerow([*arch, *names, *ends, "latency_evidence", "accuracy_evidence", "selected"])
     for point in found.front:
         shape = point.arch
         widths = "/".join(str(width) for width in shape.conv3d)
         cells = [shape.family, shape.c, shape.stages, shape.d_max, widths, shape.branches]
         values = [getattr(point, name) for name in names]
+        known = point.ranges or {}
+        between = [end for metric in METRICS for end in known.get(metric, (None, None))]
         told = [point.evidence.latency, point.evidence.accuracy]
-        writer.writerow([*cells, *values, *told, point == found.selected])
+        writer.writerow([*cells, *values, *between, *told, point == found.selected])
     return text.getvalue()

@@ -55,6 +55,14 @@ class Point(_Frozen):
     size_bytes: Count
     macs: Count
     evidence: PointEvidence
+    ranges: dict[Metric, tuple[Number, Number]] | None = None
+    """Where metrics lie at the search's confidence, of an accuracy that was carried over; None
+    where no interval is known."""
+
+    @model_serializer(mode="wrap")
+    def _told(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        told: dict[str, Any] = handler(self)
+        return {name: each for name, each in told.items() if name != "ranges" or each}
 
     def metric(self, name: Metric) -> float | None:
         """One accuracy by its name."""
@@ -108,6 +116,8 @@ class Verified(_Frozen):
     """What was tried on the device itself."""
 
     timed: Count
+    unreliable: Count
+    """Points that were timed while the machine was busy: their latencies stay predictions."""
     predicted: Count
     """Points that could not be tried here, and keep their predictions."""
     demoted: Point | None

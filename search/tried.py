@@ -5,7 +5,7 @@ where its precision changes what the network says.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -43,6 +43,9 @@ PAIRS: Final = 16
 
 METHOD: Final = "percentile"
 
+RETRIES: Final = 2
+"""How often a point is timed again while its timing is unreliable."""
+
 
 @dataclass(frozen=True)
 class Tried:
@@ -74,7 +77,7 @@ class Trials:
             path = graphs.lowered(self.question.resolution) if made else None
             path = path or graphs.float(self.question.resolution)
             session = open_session(point.runtime, path, point.precision, self.threads)
-            timing = measure(session.run, self._reference)
+            timing = self._timed(session.run)
             del session
             return Tried(timing, None if point.precision == "fp32" else self._judged(graphs))
 
@@ -84,7 +87,16 @@ class Trials:
             return None
         sized = Sized(network, self.question.resolution, point.arch.stages)
         session = open_session(point.runtime, sized, point.precision, self.threads)
-        return Tried(measure(session.run, self._reference), None)
+        return Tried(self._timed(session.run), None)
+
+    def _timed(self, run: Callable[[], None]) -> Timing:
+        """The first reliable timing, or else the last."""
+        timing = measure(run, self._reference)
+        for _ in range(RETRIES):
+            if timing.reliable:
+                break
+            timing = measure(run, self._reference)
+        return timing
 
     @cached_property
     def _reference(self) -> Reference:

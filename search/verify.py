@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from math import exp
 from statistics import NormalDist
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ from .result import Found, Point, Verified
 
 if TYPE_CHECKING:
     from ..model.metrics import Score
+    from ..profiles.timing import Timing
     from .tried import Tried
 
 Trying = Callable[[Point], "Tried | None"]
@@ -34,12 +35,20 @@ def verified(found: Found, question: Question, trying: Trying) -> Found:
     demoted. Raises `UsageError` where this machine is not the device.
     """
     require_here(question.profile)
-    front = list(_tried(found, trying))
+    shown = progress(found.front, "verifying", len(found.front))
+    tried = [(point, trying(point)) for point in shown]
+    unreliable = sum(each is not None and not each.timing.reliable for _, each in tried)
+    front = [_measured(point, each, found.confidence) for point, each in tried]
     timed = sum(point.evidence.latency == "measured" for point in front)
     chosen = choices(question, _kept(front, found))
     again = next((p for p in front if found.selected and _same(p, found.selected)), None)
     missed = again is not None and again.fps < question.target_fps
-    told = Verified(timed=timed, predicted=len(front) - timed, demoted=again if missed else None)
+    told = Verified(
+        timed=timed,
+        unreliable=unreliable,
+        predicted=len(front) - timed - unreliable,
+        demoted=again if missed else None,
+    )
     return found.model_copy(
         update={"front": tuple(_kept(front, found)), **chosen, "verified": told}
     )
@@ -57,28 +66,24 @@ def require_here(profile: Profile) -> None:
         )
 
 
-def _tried(found: Found, trying: Trying) -> Iterator[Point]:
-    """Every point, measured where it can be."""
-    doubt = NormalDist().inv_cdf((1 + found.confidence) / 2)
-    for point in progress(found.front, "verifying", len(found.front)):
-        tried = trying(point)
-        if tried is None:
-            yield point
-            continue
-        latency = tried.timing.ratio * tried.timing.own_ms
-        fps, half = 1000 / latency, doubt * tried.timing.error
-        judged = {} if tried.score is None else _figures(tried.score)
-        told = {"latency": "measured", **({"accuracy": "measured"} if judged else {})}
-        yield point.model_copy(
-            update={
-                "latency_ms": latency,
-                "fps": fps,
-                "fps_low": fps * exp(-half),
-                "fps_high": fps * exp(half),
-                "evidence": point.evidence.model_copy(update=told),
-                **judged,
-            }
-        )
+def _measured(point: Point, tried: Tried | None, confidence: float) -> Point:
+    """A point as it turned out; on a busy machine nothing is learnt of its latency."""
+    if tried is None:
+        return point
+    judged = {} if tried.score is None else _figures(tried.score)
+    timed = _timed(tried.timing, confidence) if tried.timing.reliable else {}
+    told = {name: "measured" for name, new in (("latency", timed), ("accuracy", judged)) if new}
+    evidence = point.evidence.model_copy(update=told)
+    return point.model_copy(update={**timed, **judged, "evidence": evidence})
+
+
+def _timed(timing: Timing, confidence: float) -> dict[str, float]:
+    """Latency and FPS with the interval of the timing."""
+    latency = timing.ratio * timing.own_ms
+    half = NormalDist().inv_cdf((1 + confidence) / 2) * timing.error
+    fps = 1000 / latency
+    ends = {"fps_low": fps * exp(-half), "fps_high": fps * exp(half)}
+    return {"latency_ms": latency, "fps": fps, **ends}
 
 
 def _figures(score: Score) -> dict[str, float | None]:

@@ -74,6 +74,27 @@ def test_what_holds_stays_the_pick_and_what_cannot_be_timed_keeps_its_prediction
     assert all(point in found.front for point in others)
 
 
+def test_a_busy_machine_tells_nothing_of_a_latency(by_parts: Profile) -> None:
+    """The reference never runs at its own speed: predictions stay, and are counted."""
+    question, found = asked(by_parts)
+    worse = Score(everything=Errors(pixels=1000, outliers=180, total_px=2500.0))
+
+    def busy(point: Point) -> Tried:
+        quiet = taking(SLOWER, point, worse)
+        return replace(quiet, timing=replace(quiet.timing, own_ms=5.0))
+
+    told = verified(found, question, busy)
+    assert told.verified is not None
+    assert (told.verified.timed, told.verified.unreliable) == (0, len(found.front))
+    assert told.verified.demoted is None
+    assert told.selected is not None
+    assert found.selected is not None
+    (same,) = (point for point in found.front if point.arch == told.selected.arch)
+    assert told.selected.fps == same.fps
+    assert told.selected.d1_all == 18.0
+    assert "while it was busy" in dict(_cost(told))["verified"]
+
+
 def never(point: Point) -> Tried:
     raise AssertionError(f"{point.arch.label()} is tried elsewhere than on the device")
 
