@@ -5,27 +5,20 @@
 ALONE are checkpoints of networks that the supernet holds, each trained by itself on one schedule.
 Both are judged on the same generated scenes. Kendall's tau is over the whole networks, and over
 those of fewer stages too; within a network, more stages should be better, as the paper has it.
-
-    python benchmarks/inherited.py SUPERNET --widths [--size 320x160] [--count 100] [--json]
-
-tells what another 3D width or number of planes does to the D1-all of the whole network: the mean
-over several c of the ratio to the paper's widths and planes, and how far it differs between them.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from statistics import mean
 from tempfile import mkdtemp
-from typing import Any
 
 from scipy.stats import kendalltau
 
-from rts2.model.arch import CONV3D, SPACE_CONV3D, Arch
+from rts2.model.arch import Arch
 from rts2.model.box import named_model
 from rts2.model.checkpoint import load
 from rts2.model.console import resolution
@@ -38,57 +31,17 @@ Found = dict[int, tuple[float, float]]
 """D1-all by stages: trained alone, and inherited."""
 
 
-CS = (2, 4, 8, 16)
-"""The networks whose widths and planes are changed."""
-
-
 def main() -> None:
-    """One of the two tables, or the figures as JSON."""
+    """The table, or its figures as JSON."""
     options = _options()
-    if not (options.alone or options.widths):
-        print("nothing to compare: give checkpoints of networks trained alone, or --widths")
+    if not options.alone:
+        print("{}" if options.json else "nothing to compare: give networks trained alone")
         return
     judging = open_dataset("streets", split="val", count=options.count, size=options.size)
     training = open_dataset("streets", split="train", count=BATCH * BATCHES, size=options.size)
     data = Data.of(training, judging, options.count)
     judge = Inherited(named_model(options.supernet), data, options.out)
-    (_effects if options.widths else _orders)(judge, data, options)
-
-
-def _effects(judge: Inherited, data: Data, options: argparse.Namespace) -> None:
-    """What each width and number of planes does, the others being the paper's."""
-    bases = [arch for arch in (Arch(c=c) for c in CS) if not judge.outside(arch)]
-    found = {}
-    for name, change in _changes():
-        archs = [(base, base.model_copy(update=change)) for base in bases]
-        held = [pair for pair in archs if not judge.outside(pair[1])]
-        ratios = [_d1(judge, arch) / _d1(judge, base) for base, arch in held]
-        if ratios:
-            found[name] = mean(ratios), max(ratios) - min(ratios)
-    if options.json:
-        print(json.dumps({name: ratio for name, (ratio, _) in found.items()}))
-        return
-    print(f"D1-all over that of the paper's 3D widths and planes, on {len(data.judging)} scenes")
-    for name, (ratio, spread) in found.items():
-        print(f"  {name:20} {ratio:.3f}   {spread:.3f} between c = {', '.join(map(str, CS))}")
-
-
-def _changes() -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every other value of one dimension, by name, and how it changes a network."""
-    for stage, widths in enumerate(SPACE_CONV3D):
-        for width in widths:
-            if width != CONV3D[stage]:
-                wide = (*CONV3D[:stage], width, *CONV3D[stage + 1 :])
-                yield f"width {width}, stage {stage + 1}", {"conv3d": wide}
-    for d_max in (6, 8, 10, 16, 20, 24):
-        yield f"d_max {d_max}", {"d_max": d_max}
-
-
-def _d1(judge: Inherited, arch: Arch) -> float:
-    """The inherited D1-all of the whole network."""
-    (found,) = (row.d1_all for row in judge.rows(arch) if row.arch == arch)
-    assert found is not None
-    return found
+    _orders(judge, data, options)
 
 
 def _orders(judge: Inherited, data: Data, options: argparse.Namespace) -> None:
@@ -143,7 +96,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("alone", nargs="*", type=Path)
     parser.add_argument("--size", type=resolution, default=(320, 160))
     parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--widths", action="store_true")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

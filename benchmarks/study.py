@@ -2,8 +2,9 @@
 
     python benchmarks/study.py [TABLE] [--budget 200] [--target-fps 5] [--picture FILE.png] [--json]
 
-TABLE is a file of accuracies (rts2.accuracy/1) that has every network of a grid of chains; without
-one there is nothing to compare. Every sampler judges chains: what a network holds is known with it.
+TABLE is a file of accuracies (rts2.accuracy/1) that has every network of a grid of chains, the one
+that benchmarks/grid.py made unless told. Every sampler judges chains: what a network holds is known
+with it.
 The volume below the front is in latency on a Jetson TX2, D1-all and mIoU, up to the target, as a
 share of what all chains of the table have; means and extremes of five seeds.
 """
@@ -36,7 +37,7 @@ from rts2.search.space import Space
 SEEDS = 5
 BAR = 0.98
 METRICS = ("d1_all", "miou")
-REFERENCE = Path(__file__).parents[1] / "search" / "measured" / "reference.json"
+REFERENCE = Path(__file__).with_name("reference.json")
 
 Points = dict[int, list[tuple[float, ...]]]
 
@@ -176,9 +177,6 @@ def draw(found: dict[str, list[list[float]]], path: Path) -> None:
 def main() -> None:
     """Prints the table, or its shares as JSON."""
     options = _options()
-    if not options.table.is_file():
-        print("{}" if options.json else f"nothing to compare: there is no table {options.table}")
-        return
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     question = Question(load("tx2"), options.target_fps, allow_extrapolated=True)
     grid = Grid.of(read_json(options.table, MeasuredRows, "a table of accuracies"), question)

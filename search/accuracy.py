@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
@@ -50,6 +50,9 @@ class Accuracy:
     exact: NDArray[np.bool_]
     """Where a row of the source names this very network."""
     extrapolated: NDArray[np.bool_]
+    doubt: dict[Metric, Floats] = field(default_factory=dict)
+    """The standard deviation of each metric, on the scale of `unbounded`, where it was carried
+    over, zero elsewhere; no entry where nothing is known of it."""
 
 
 class AccuracySource(Protocol):
@@ -74,3 +77,15 @@ def over_c(cs: Sequence[int] | Floats, pairs: Iterable[tuple[int, float]]) -> Fl
         return np.full(len(cs), np.nan)
     xs, ys = zip(*known, strict=True)
     return np.asarray(np.interp(np.log2(cs), np.log2(xs), ys))
+
+
+def unbounded(metric: Metric, values: Floats) -> Floats:
+    """A metric on a scale on which differences carry over from weak networks to strong ones: the
+    natural logarithm of a percentage's odds, and of the EPE.
+    """
+    return np.log(values) if metric == "epe" else np.log(values / (100 - values))
+
+
+def bounded(metric: Metric, values: Floats) -> Floats:
+    """The inverse of `unbounded`."""
+    return np.exp(values) if metric == "epe" else 100 / (1 + np.exp(-values))

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import exp, log1p
+from statistics import NormalDist
 from typing import TypedDict
 
 import numpy as np
@@ -27,7 +28,7 @@ from ..profiles.latency import Floats, LatencyModel, latencies_ms
 from ..profiles.parts import PartModel
 from ..profiles.profile import Calibration, Profile, Resolution, Runtime
 from ..profiles.profile import Point as Timing
-from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric
+from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric, bounded, unbounded
 from .front import fastest, nondominated, pick
 from .lowered import Lowered, measured
 from .result import Coverage, Found, LeftOut, Point, PointEvidence, Task
@@ -89,6 +90,8 @@ class _Columns:
     """(n, metrics)"""
     evidence: NDArray[np.int64]
     """(n, 2): latency's and accuracy's, as positions in `EVIDENCE`."""
+    doubt: dict[Metric, Floats]
+    """Of each metric over the whole block, as its `Accuracy` has it."""
 
 
 EVIDENCE: tuple[Evidence, ...] = ("published", "measured", "interpolated", "extrapolated")
@@ -342,6 +345,7 @@ class _Block:
             half_width=self._half_width(at, timing == EXTRAPOLATED),
             metrics=np.stack(metrics, 1),
             evidence=evidence,
+            doubt=self.accuracy.doubt,
         )
 
     def _accuracy_evidence(self, exact: Evidence) -> NDArray[np.int64]:
@@ -508,7 +512,11 @@ def _points(
         position = np.unravel_index(flat, space.shape(stages))
         latency, half = float(columns.latency_ms[at]), float(columns.half_width[at])
         told = [EVIDENCE[code] for code in columns.evidence[at]]
-        known = zip(METRICS, columns.metrics[at], strict=True)
+        known = {
+            metric: None if np.isnan(value) else float(value)
+            for metric, value in zip(METRICS, columns.metrics[at], strict=True)
+        }
+        doubt = {metric: float(values[position]) for metric, values in columns.doubt.items()}
         yield Point(
             arch=space.arch(stages, tuple(int(index) for index in position)),
             precision=executor.precision,
@@ -521,5 +529,20 @@ def _points(
             size_bytes=int(weights[flat]) * BYTES_PER_WEIGHT[executor.precision],
             macs=int(macs[flat]),
             evidence=PointEvidence(latency=told[0], accuracy=told[1]),
-            **{metric: None if np.isnan(value) else float(value) for metric, value in known},
+            ranges=_ranges(known, doubt, question.confidence),
+            **known,
         )
+
+
+def _ranges(
+    known: dict[Metric, float | None], doubt: dict[Metric, float], confidence: float
+) -> dict[Metric, tuple[float, float]] | None:
+    """The interval of each metric that is in doubt; None where none is."""
+    sure = NormalDist().inv_cdf((1 + confidence) / 2)
+    found = {}
+    for metric, value in known.items():
+        if value is not None and (half := sure * doubt.get(metric, 0.0)):
+            ends = unbounded(metric, np.array(value)) + np.array([-half, half])
+            low, high = bounded(metric, ends)
+            found[metric] = float(low), float(high)
+    return found or None

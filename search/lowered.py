@@ -88,7 +88,8 @@ class Lowered:
             for metric in METRICS
         }
         inside = _wide(self._inside(space.c, stages, precision), dimensions)
-        return Accuracy(changed, np.zeros_like(accuracy.exact), accuracy.extrapolated | ~inside)
+        outside = accuracy.extrapolated | ~inside
+        return Accuracy(changed, np.zeros_like(accuracy.exact), outside, accuracy.doubt)
 
     def _change(
         self, cs: Sequence[int], stages: int, precision: Precision, metric: Metric

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ..model.arch import CONV3D, STRIDES, Arch, Branches
+from ..model.arch import STRIDES, Arch, Branches
 from ..model.files import parse_json, read_json
 from ..profiles.evidence import BRANCHES, boxes
 from ..profiles.latency import Floats
-from .accuracy import METRICS, Accuracy, AccuracySource, Metric, Row, over_c
+from .accuracy import METRICS, Accuracy, AccuracySource, Metric, Row, bounded, over_c, unbounded
+from .effects import Effects, measured_effects
 from .space import Space
 
 
@@ -84,7 +85,8 @@ def source(name: str) -> AccuracySource:
     """
     if name == "published":
         text = (resources.files(__package__) / "published" / "kitti2015.json").read_text("utf-8")
-        return Published(parse_json(text, PublishedRows, "the published accuracies"))
+        table = parse_json(text, PublishedRows, "the published accuracies")
+        return Published(table, measured_effects())
     return Measured(read_json(Path(name), MeasuredRows, "a table of accuracies"))
 
 
@@ -95,33 +97,36 @@ class Published:
     Over c it is linear in log2(c). A stage count other than three keeps the ratio of its D1 to
     the full network's, known at few c and held constant beyond them (then extrapolated). The
     variant without refinement lies between its neighbours by the share that the ablation gives.
-    A first volume too small for a disparity loses the pixels that have it.
+    A first volume too small for a disparity loses the pixels that have it. What else other planes
+    and 3D widths change is carried over from networks of shared weights.
     """
 
     table: PublishedRows
+    effects: Effects
     exact_evidence: Literal["published"] = "published"
     named: tuple[Arch, ...] = ()
 
     def columns(self, space: Space, stages: int) -> Accuracy:
-        """NaN for 3D widths other than the paper's, and where no row says anything."""
-        metrics = {metric: self._metric(space, stages, metric) for metric in METRICS}
+        """NaN where neither a row nor an effect says anything."""
+        effects = {metric: self.effects.of(space, stages, metric) for metric in METRICS}
+        metrics = {
+            metric: bounded(metric, unbounded(metric, self._metric(space, stages, metric)) + effect)
+            for metric, (effect, _) in effects.items()
+        }
+        doubt = {
+            metric: np.broadcast_to(d, space.shape(stages)) for metric, (_, d) in effects.items()
+        }
         box = boxes(row.arch for row in self.table.rows)[stages]
-        return Accuracy(
-            metrics,
-            _mark_rows(space, stages, self.table.rows, metrics),
-            ~space.inside(stages, box),
-        )
+        exact = _mark_rows(space, stages, self.table.rows, metrics)
+        return Accuracy(metrics, exact, ~space.inside(stages, box), doubt)
 
     def _metric(self, space: Space, stages: int, metric: Metric) -> Floats:
+        """With the paper's 3D widths, (variants, c, d_max, 1 for each stage)."""
         per_c = np.full((len(BRANCHES), len(space.c)), np.nan)
         known = self._by_c(space.c, metric) * self._stage_ratio(space.c, stages, metric)
         per_c[:] = known
-        per_d_max = self._lost(space.d_max, metric)
-        values = per_c[:, :, None] + per_d_max
-        for stage in range(stages):
-            usual = np.where(np.array(space.conv3d[stage]) == CONV3D[stage], 0.0, np.nan)
-            values = values[..., None] + usual
-        return values
+        values = per_c[:, :, None] + self._lost(space.d_max, metric)
+        return values.reshape(*values.shape, *[1] * stages)
 
     def _by_c(self, cs: Sequence[int], metric: Metric) -> Floats:
         """The metric of three-stage networks, (variants, c)."""

@@ -181,7 +181,14 @@ def read_back(line: dict[str, str]) -> Point:
     values |= {name: line[name] for name in ("latency_ms", "fps", "fps_low", "fps_high")}
     values |= {metric: line[metric] or None for metric in METRICS}
     told = {"latency": line["latency_evidence"], "accuracy": line["accuracy_evidence"]}
-    return Point.model_validate({"arch": arch, "evidence": told, **values})
+    ranges = {
+        metric: (line[f"{metric}_low"], line[f"{metric}_high"])
+        for metric in METRICS
+        if line[f"{metric}_low"]
+    }
+    return Point.model_validate(
+        {"arch": arch, "evidence": told, "ranges": ranges or None, **values}
+    )
 
 
 def test_the_spreadsheet_of_an_empty_front_is_its_header() -> None:

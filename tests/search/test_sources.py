@@ -1,6 +1,7 @@
 """Accuracies against the paper's tables, written down by hand, and what follows from them."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 
 from rts2.model.arch import Arch
 from rts2.model.errors import Rts2Error, UsageError
+from rts2.profiles.evidence import BRANCHES
 from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, Accuracy, Metric
+from rts2.search.effects import EffectRows, Effects
 from rts2.search.sources import Disparities, Measured, Published, source
 from rts2.search.space import Space
 
@@ -176,17 +179,25 @@ def test_what_the_paper_never_reports_is_unknown(stages: int) -> None:
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3])
-def test_nothing_is_known_of_other_3d_widths(stages: int) -> None:
+def test_other_3d_widths_are_extrapolated_and_in_doubt(stages: int) -> None:
+    """As far as the metric is known of the paper's own; a row alone tells of no other network."""
     space = Space(c=(8,), d_max=(12,))
     usual = np.ones(space.shape(stages), dtype=bool)
     for stage, width in enumerate((16, 4, 4)[:stages]):
         usual &= space.along(stages, 3 + stage) == width
     assert np.count_nonzero(usual) == 3
     columns = published().columns(space, stages)
+    assert columns.extrapolated[~usual].all()
+    assert not columns.extrapolated[usual].any()
     for metric in METRICS:
-        values = np.broadcast_to(columns.metrics[metric], usual.shape)
-        assert np.isnan(values[~usual]).all()
-    assert not np.isnan(columns.metrics["d1_all"][usual]).any()
+        known = ~np.isnan(columns.metrics[metric])
+        own = known[usual].reshape(3, *[1] * (usual.ndim - 1))
+        assert (known <= own).all()
+        doubt = columns.doubt[metric]
+        assert not doubt[usual].any()
+        if metric in ("d1_all", "epe"):  # class scores see no volume
+            assert (doubt[known & ~usual] > 0).all()
+    assert not np.isnan(columns.metrics["d1_all"]).any()
 
 
 def test_extrapolated_is_what_lies_outside_of_the_rows() -> None:
@@ -214,9 +225,26 @@ def test_a_share_and_an_overshoot_by_hand() -> None:
     assert few.overshoot(1) == pytest.approx((1.5 * 6 + 2.5 * 4) / 20)
 
 
+def no_effect(stages: int, branches: str, metric: str) -> dict[str, Any]:
+    flat = {"values": [2, 32], "effects": [0, 0]}
+    told = {"stages": stages, "branches": branches, "metric": metric, "spread": 0}
+    return {**told, "d_max": flat, "conv3d": [flat] * stages}
+
+
+NO_EFFECT = EffectRows.model_validate(
+    {
+        "schema": "rts2.effects/1",
+        "protocol": "nothing but the disparities that are lost",
+        "inherited": 0,
+        "rows": [no_effect(*each) for each in product((1, 2, 3), BRANCHES, METRICS)],
+    }
+)
+
+
 def with_counts(counts: tuple[int, ...]) -> Published:
     disparities = Disparities(counts=counts, source="by hand")
-    return Published(published().table.model_copy(update={"disparities": disparities}))
+    table = published().table.model_copy(update={"disparities": disparities})
+    return Published(table, Effects(NO_EFFECT))
 
 
 def test_a_small_first_volume_loses_the_far_disparities() -> None:
@@ -241,19 +269,20 @@ def test_a_small_first_volume_loses_the_far_disparities() -> None:
 
 
 def test_a_larger_first_volume_gains_what_the_papers_loses() -> None:
-    """One pixel in ten at 200.5: twelve planes end at 192, thirteen at 208."""
+    """One pixel in a hundred at 200.5: twelve planes end at 192, thirteen at 208."""
     space = Space(c=(8, 9), d_max=(12, 13), conv3d=((16,), (4,), (4,)))
-    metrics = with_counts((9, *[0] * 199, 1)).columns(space, 3).metrics
+    metrics = with_counts((99, *[0] * 199, 1)).columns(space, 3).metrics
     d1 = metrics["d1_all"].reshape(3, 2, 2)
-    assert d1[..., 1] - d1[..., 0] == pytest.approx(np.full((3, 2), -10))
+    assert d1[..., 1] - d1[..., 0] == pytest.approx(np.full((3, 2), -1))
     epe = metrics["epe"].reshape(3, 2, 2)
-    assert epe[..., 1] - epe[..., 0] == pytest.approx(np.full((3, 2), -0.85))
+    assert epe[..., 1] - epe[..., 0] == pytest.approx(np.full((3, 2), -0.085))
 
 
-def test_more_planes_are_never_worse_with_the_shipped_disparities() -> None:
+def test_more_planes_never_lose_more_of_the_shipped_disparities() -> None:
     space = Space(c=(8,), conv3d=((16,), (4,), (4,)))
+    found = replace(published(), effects=Effects(NO_EFFECT)).columns(space, 3)
     for metric in ("d1_all", "epe"):
-        values = published().columns(space, 3).metrics[metric].reshape(3, len(space.d_max))
+        values = found.metrics[metric].reshape(3, len(space.d_max))
         assert (np.diff(values, axis=1) <= 1e-12).all()
         assert (values[:, 0] > values[:, 6]).all()
 
