@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any, Final
 
-import jinja2
-
+from .html import DASH, template
 from .maps import FAR_PX, NEAR_PX, WIDEST_PX, Example, scales, shown
 
 __all__ = ["Example", "page"]
@@ -19,9 +17,6 @@ EXAMPLES: Final = 3
 
 PICTURES_CHARS: Final = 2_000_000
 """What the pictures of a page may take, so that it can be sent by mail."""
-
-DASH: Final = "–"
-"""Stands where nobody knows."""
 
 TIMES: Final = re.compile(r"(?P<title>.+?)(?:: | \()(?P<times>[\d.]+ → [\d.]+ ms)\)?")
 """A reason that ends in the layer's own times."""
@@ -138,7 +133,7 @@ def page(report: Mapping[str, Any], examples: Sequence[Example]) -> str:
     """
     layers = [dict(row, part=part_of(row["layer"])) for row in report["layers"]]
     disparities, differences = scales()
-    return _template().render(
+    return template(__package__, "report.html").render(
         report=report,
         changes=changes(report),
         layers=layers,
@@ -218,30 +213,3 @@ def _highest(values: Iterable[float | None]) -> float:
 
 def _scaled(value: float | None, scale: float) -> float | None:
     return None if value is None else value * scale
-
-
-def number(value: float | None, digits: int) -> str:
-    """A number with its thousands apart; a dash where nobody knows."""
-    return DASH if value is None else f"{_rounded(value, digits):,.{digits}f}".replace("-", "−")
-
-
-def difference(value: float | None, digits: int) -> str:
-    """A number with its sign, ±0 where the digits show no other; a dash where nobody knows."""
-    if value is None:
-        return DASH
-    seen = _rounded(value, digits)
-    return ("+" if seen > 0 else "" if seen else "±") + number(value, digits)
-
-
-def _rounded(value: float, digits: int) -> float:
-    """Without the sign of a zero."""
-    return round(value, digits) or 0.0
-
-
-def _template() -> jinja2.Template:
-    text = (resources.files(__package__) / "templates" / "report.html").read_text("utf-8")
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters |= {"number": number, "difference": difference}
-    return environment.from_string(text)

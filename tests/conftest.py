@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from .browser import Browser
+
 # Tests run side by side, one a core; torch reads this when it is first imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -19,6 +21,15 @@ def real_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"RTS2_DATA names no folder: {path}"
     return path
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    """A browser; without one the test is skipped."""
+    found = Browser.found(tmp_path_factory.mktemp("browser"))
+    if found is None:
+        pytest.skip("needs a browser: install chromium")
+    return found
 
 
 @pytest.fixture(scope="session", autouse=True)
