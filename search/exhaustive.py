@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from math import exp, log1p
 from statistics import NormalDist
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,14 @@ class Question:
     max_size_bytes: float = float("inf")
     min_disparity: float = 0.0
     """The widest disparity that must fit into the first volume, in pixels."""
+
+
+class Candidate(NamedTuple):
+    """One network in one precision under one runtime."""
+
+    arch: Arch
+    precision: Precision
+    runtime: Runtime
 
 
 @dataclass(frozen=True)
@@ -118,18 +127,13 @@ def search(
     for arch in source.named:
         if space.position(arch) is None:
             raise UsageError(f"{arch.label()} was measured, and lies outside of the space")
-    executors = _executors(question)
+    executors = executors_of(question)
     totals = _Totals(space)
     found: list[_Columns] = []
     left_out = Counter[str]()
-    for stages in space.stages:
-        accuracy = source.columns(space, stages)
-        for index, executor in enumerate(executors):
-            own = lowered.applied(accuracy, space, stages, executor.precision)
-            known = lowered.knows(executor.precision)
-            block = _Block(space, question, executor, own, known, totals, stages)
-            left_out.update(block.leave_out())
-            found.append(block.columns(index, source.exact_evidence))
+    for index, block in _blocks(question, source, space, lowered, executors, totals):
+        left_out.update(block.leave_out())
+        found.append(block.columns(index, source.exact_evidence, block.left()))
     front = _front(question, totals, executors, found)
     size = space.size() * len(executors)
     return Found(
@@ -145,6 +149,35 @@ def search(
         left_out=tuple(LeftOut(reason=r, count=n) for r, n in left_out.most_common()),
         elapsed_s=time.perf_counter() - started,
     )
+
+
+def look_up(
+    question: Question,
+    source: AccuracySource,
+    wanted: Iterable[Candidate],
+    space: Space | None = None,
+    lowered: Lowered | None = None,
+) -> dict[Candidate, Point]:
+    """What `search` with these arguments knows of some candidates, chosen or left out.
+
+    Those that lie outside of the space or of the question's executors are missing. Raises as
+    `search` does.
+    """
+    space = space or Space()
+    executors, totals = executors_of(question), _Totals(space)
+    archs: dict[tuple[int, Precision, Runtime], list[tuple[int, ...]]] = {}
+    for arch, precision, runtime in wanted:
+        if (position := space.position(arch)) is not None:
+            archs.setdefault((arch.stages, precision, runtime), []).append(position)
+    found: dict[Candidate, Point] = {}
+    for index, block in _blocks(question, source, space, lowered or measured(), executors, totals):
+        own = block.executor
+        if positions := archs.get((block.stages, own.precision, own.runtime)):
+            at = np.ravel_multi_index(tuple(np.transpose(positions)), block.shape)
+            columns = block.columns(index, source.exact_evidence, at)
+            for point in _points(question, totals, executors, columns, np.arange(len(at))):
+                found[Candidate(point.arch, point.precision, point.runtime)] = point
+    return found
 
 
 @dataclass(frozen=True)
@@ -166,7 +199,7 @@ class Speed:
 def speeds(question: Question, space: Space) -> Iterator[Speed]:
     """Every executor and stage count of the space; raises as `search` does."""
     totals = _Totals(space)
-    for executor in _executors(question):
+    for executor in executors_of(question):
         for stages in space.stages:
             none = np.zeros(space.shape(stages), dtype=bool)
             nothing = Accuracy({}, none, none)
@@ -210,7 +243,7 @@ def choices(question: Question, front: list[Point]) -> Choices:
     }
 
 
-def _executors(question: Question) -> list[Executor]:
+def executors_of(question: Question) -> list[Executor]:
     """The device's runtimes and precisions that the question admits."""
     profile = question.profile
     for precision in question.precisions:
@@ -232,6 +265,23 @@ def _executors(question: Question) -> list[Executor]:
         known = ", ".join(f"{e.precision} on {e.runtime}" for e in every)
         raise UsageError(f"{profile.title} has no latency for that choice; it has {known}")
     return chosen
+
+
+def _blocks(
+    question: Question,
+    source: AccuracySource,
+    space: Space,
+    lowered: Lowered,
+    executors: list[Executor],
+    totals: _Totals,
+) -> Iterator[tuple[int, _Block]]:
+    """Every stage count and executor, with the executor's number."""
+    for stages in space.stages:
+        accuracy = source.columns(space, stages)
+        for index, executor in enumerate(executors):
+            own = lowered.applied(accuracy, space, stages, executor.precision)
+            known = lowered.knows(executor.precision)
+            yield index, _Block(space, question, executor, own, known, totals, stages)
 
 
 class _Totals:
@@ -287,8 +337,12 @@ class _Block:
         self.space, self.question, self.executor = space, question, executor
         self.accuracy, self.known, self.totals, self.stages = accuracy, known, totals, stages
         self.shape = space.shape(stages)
-        self.latency_ms = totals.latency_ms(executor.model, question.resolution, stages)
         self._free = np.ones(self.shape, dtype=bool)
+
+    @cached_property
+    def latency_ms(self) -> Floats:
+        """As the executor's model predicts it."""
+        return self.totals.latency_ms(self.executor.model, self.question.resolution, self.stages)
 
     def leave_out(self) -> dict[str, int]:
         """Removes what cannot be chosen; counts it by reason, each candidate once."""
@@ -330,9 +384,12 @@ class _Block:
             yield reason, unknown & unusual
         yield f"no {name} is known for their stages and branches", unknown
 
-    def columns(self, executor: int, exact: Evidence) -> _Columns:
-        """What is left, flattened. `exact` is what a row of the accuracy source counts as."""
-        at = np.flatnonzero(self._free)
+    def left(self) -> NDArray[np.int64]:
+        """The positions of what is not left out, in the flattened block."""
+        return np.flatnonzero(self._free)
+
+    def columns(self, executor: int, exact: Evidence, at: NDArray[np.int64]) -> _Columns:
+        """The candidates at `at`. `exact` is what a row of the accuracy source counts as."""
         latency, timing = self._latency()
         latency, timing = latency.reshape(-1)[at], timing.reshape(-1)[at]
         metrics = [self.accuracy.metrics[metric].reshape(-1)[at] for metric in METRICS]

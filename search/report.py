@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console, JustifyMethod
 from rich.table import Table
@@ -15,6 +16,9 @@ from ..profiles.profile import Profile, Runtime
 from .accuracy import METRICS, Metric
 from .front import loss, pick
 from .result import Found, Point
+
+if TYPE_CHECKING:
+    from .exhaustive import Candidate
 
 AXIS: dict[Metric, str] = {
     "d1_all": "D1-all in percent",
@@ -40,7 +44,7 @@ def name_of(point: Point) -> str:
     return f"{point.arch.label()}, {executor_of(point)}"
 
 
-def executor_of(point: Point) -> str:
+def executor_of(point: Point | Candidate) -> str:
     """What runs a candidate, such as fp32 on OpenVINO."""
     return f"{point.precision} on {RUNTIMES[point.runtime]}"
 
@@ -61,13 +65,24 @@ def headline(found: Found, title: str) -> str:
     return f"RTS²Net on {title} · {width}×{height} · {TASKS[found.task]}"
 
 
+def scope(found: Found) -> str:
+    """How much was searched, and how long that took."""
+    return f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
+
+
+def remarks(found: Found, profile: Profile) -> list[tuple[str, str]]:
+    """The pick, the prospect, the cost, what was left out and the notes, each with its label.
+
+    A label that is empty goes on with the one before it.
+    """
+    return [*_verdict(found), *_cost(found), *_left_out(found), *_notes(found, profile)]
+
+
 def show(found: Found, profile: Profile, written: Sequence[str], console: Console) -> None:
     """Prints the table of the front, the pick, the prospect, and what was left out."""
-    scope = f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
-    console.print(Text(f"{headline(found, profile.title)} · {scope}\n"))
+    console.print(Text(f"{headline(found, profile.title)} · {scope(found)}\n"))
     console.print(_table(found, console.width))
-    lines = [*_verdict(found), *_cost(found), *_left_out(found), *_notes(found, profile)]
-    for label, text in [*lines, ("written", "  ".join(written))]:
+    for label, text in [*remarks(found, profile), ("written", "  ".join(written))]:
         row = Table.grid(padding=(0, 2))
         row.add_column(width=9)
         row.add_column(overflow="fold")
@@ -77,7 +92,7 @@ def show(found: Found, profile: Profile, written: Sequence[str], console: Consol
 
 def _table(found: Found, width: int) -> Table:
     """The shown points; what all of them agree on becomes a line below."""
-    shown = _thinned(_believable(found), found)
+    shown = _thinned(believable(found), found)
     rows = [_row(point) for point in shown]
     cells = dict(zip(COLUMNS, zip(*rows, strict=True), strict=True)) if rows else {}
     constant = {n: cells[n][0] for n in CONSTANT if len(rows) > 1 and len(set(cells[n])) == 1}
@@ -107,7 +122,7 @@ def _caption(found: Found, constant: dict[str, str], hidden: int) -> str:
     return "\n".join(parts)
 
 
-def _believable(found: Found) -> list[Point]:
+def believable(found: Found) -> list[Point]:
     """The points on the pick's evidence or better; without a pick, on the best that there is."""
     proven = [point for point in found.front if point.proven]
     known = [point for point in found.front if point.evidence.accuracy != "extrapolated"]

@@ -20,7 +20,7 @@ from rts2.profiles.conformal import half_width
 from rts2.profiles.latency import LatencyModel, predict_ms
 from rts2.profiles.profile import Profile, load
 from rts2.search.accuracy import LOWER_IS_BETTER, METRICS, AccuracySource
-from rts2.search.exhaustive import EVIDENCE, Question, _Block, _executors, _Totals, search
+from rts2.search.exhaustive import EVIDENCE, Question, _Block, _Totals, executors_of, search
 from rts2.search.lowered import Lowered, LoweredRows, Row
 from rts2.search.result import Found
 from rts2.search.sources import source
@@ -612,7 +612,7 @@ def test_a_profile_by_parts_gives_every_network_of_a_block_its_latency(
     assert {arch for arch, _ in timed} <= set(archs(space))
     model = by_parts.calibrations[0].model
     asked = Question(by_parts, 1, resolution, task="stereo")
-    (executor,) = _executors(asked)
+    (executor,) = executors_of(asked)
     totals = _Totals(space)
     for stages in space.stages:
         block = _Block(
@@ -667,7 +667,7 @@ def test_each_runtime_predicts_with_its_own_tables(two_runtimes: Profile) -> Non
 
 
 def test_a_precision_of_one_runtime_alone_is_asked_for(two_runtimes: Profile) -> None:
-    only = _executors(Question(two_runtimes, 1, precisions=("bf16",)))
+    only = executors_of(Question(two_runtimes, 1, precisions=("bf16",)))
     assert [(e.runtime, e.precision) for e in only] == [("openvino", "bf16")]
     with pytest.raises(UsageError, match="has no latency for that choice; it has fp32 on onnx"):
         search(
