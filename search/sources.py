@@ -84,10 +84,14 @@ def source(name: str) -> AccuracySource:
         Rts2Error: the file is no accuracy table; names the first wrong field.
     """
     if name == "published":
-        text = (resources.files(__package__) / "published" / "kitti2015.json").read_text("utf-8")
-        table = parse_json(text, PublishedRows, "the published accuracies")
-        return Published(table, measured_effects())
+        return Published(published(), measured_effects())
     return Measured(read_json(Path(name), MeasuredRows, "a table of accuracies"))
+
+
+def published() -> PublishedRows:
+    """The paper's accuracy tables, which come with rts2."""
+    text = (resources.files(__package__) / "published" / "kitti2015.json").read_text("utf-8")
+    return parse_json(text, PublishedRows, "the published accuracies")
 
 
 @dataclass(frozen=True)
