@@ -12,11 +12,10 @@ from matplotlib.figure import Figure
 from ..model.files import replacing
 from ..profiles.evidence import Evidence
 from .accuracy import LOWER_IS_BETTER
+from .palette import ACCENT, COLOURS, INK, PALE, PROMISE
 from .report import AXIS, caption, executor_of, headline
 from .result import Found, Point
 
-INK, PALE, ACCENT, PROMISE = "#1f2933", "#9aa5b1", "#c2410c", "#1d6fa5"
-COLOURS = (INK, "#2e7d6b", "#8b5fbf", "#b58900", "#5b7fa6", "#a0526d")
 """One for each runtime and precision of the proven points, where there are several."""
 MARKERS: dict[Evidence, str] = {
     "published": "s",
