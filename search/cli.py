@@ -31,6 +31,7 @@ from ..model.files import output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
 from ..profiles.here import differences
 from ..profiles.profile import Profile, Runtime, load, names
+from .accuracy import AccuracySource
 from .deploy.cli import deploy
 from .deploy.configuration import of_point
 from .exhaustive import Question
@@ -55,11 +56,12 @@ def search(arguments: Sequence[str] | None = None) -> int:
     weights = supernet(options.accuracy)
     _require_supernet(options, weights)
     if weights is None:
-        found = search_all(question, source(options.accuracy))
+        known = source(options.accuracy)
+        found = search_all(question, known)
     else:
-        found = _measured(options, question, weights)
+        found, known = _measured(options, question, weights)
     _warn_of_differences(profile, options.device)
-    written = _write(found, profile, out)
+    written = _write(found, question, known, out)
     if options.json:
         print_json(found.model_dump(mode="json", by_alias=True))
     else:
@@ -84,10 +86,12 @@ def _require_supernet(options: argparse.Namespace, weights: Path | None) -> None
         raise UsageError(f"{weights} is judged on your data; give --data DIR, or --data {STREETS}")
 
 
-def _measured(options: argparse.Namespace, question: Question, weights: Path) -> Found:
-    """What a study of a supernet finds; writes the pick's weights."""
+def _measured(
+    options: argparse.Namespace, question: Question, weights: Path
+) -> tuple[Found, AccuracySource]:
+    """What a study of a supernet finds, and the accuracies it judged; writes the pick's weights."""
     from .storage import sqlite
-    from .study import BUDGET, Order, found_by, run
+    from .study import BUDGET, Order, found_by, run, source_of
     from .supernet import CACHE, Source, trained_s
     from .verify import require_here, verified
 
@@ -141,7 +145,7 @@ def _measured(options: argparse.Namespace, question: Question, weights: Path) ->
         save(own.network(arch), options.out / PICK, origin)
     else:
         remove(options.out / PICK)
-    return found.model_copy(update={"cost": cost})
+    return found.model_copy(update={"cost": cost}), source_of(studied)
 
 
 @contextmanager
@@ -223,6 +227,9 @@ STUDY = ("data", "dataset", "split", "data_size", "budget", "workers", "storage"
 PICK = "pick.safetensors"
 """The weights of a measured search's pick."""
 
+PAGE = "report.html"
+"""All that was found, for people."""
+
 
 def _add_study(described: argparse.ArgumentParser) -> None:
     add = described.add_argument_group("when a supernet judges").add_argument
@@ -290,14 +297,19 @@ def _min_disparity(options: argparse.Namespace) -> float:
     return float(focal * baseline / depth)
 
 
-def _write(found: Found, profile: Profile, out: Path) -> list[str]:
+def _write(found: Found, question: Question, known: AccuracySource, out: Path) -> list[str]:
+    from .page import page
     from .plot import save
     from .report import as_csv
+    from .sensitivity import sensitivity
 
+    profile, base = question.profile, found.selected or found.nearest
     write_json(out / "front.json", found.model_dump(mode="json", by_alias=True))
     write_bytes(out / "front.csv", as_csv(found).encode())
     save(found, profile.title, out / "front.png")
-    written = [f"{out}/", "front.json", "front.csv", "front.png"]
+    dimensions = sensitivity(question, known, base) if base else ()
+    write_bytes(out / PAGE, page(found, profile, dimensions).encode())
+    written = [f"{out}/", "front.json", "front.csv", "front.png", PAGE]
     if found.cost is not None and found.selected is not None:
         written.append(PICK)
     if found.selected is None:

@@ -306,10 +306,14 @@ def run(order: Order, workers: int = 1, shown: Shown = unseen) -> Studied:
     return own.studied(before)
 
 
+def source_of(studied: Studied) -> Measured:
+    """What the study judged, as a source of accuracy."""
+    return Measured(MeasuredRows(schema="rts2.accuracy/1", rows=studied.rows))
+
+
 def found_by(order: Order, studied: Studied) -> Found:
     """The exact front over everything that the study judged."""
-    rows = MeasuredRows(schema="rts2.accuracy/1", rows=studied.rows)
-    return search_all(order.question, Measured(rows))
+    return search_all(order.question, source_of(studied))
 
 
 def name_of(order: Order, digest: str) -> str:

@@ -1,0 +1,214 @@
+"""What a person reads of a search: one HTML page that needs nothing beside it and no network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Literal
+
+from markupsafe import Markup
+
+from ..profiles.evidence import BRANCHES
+from ..profiles.profile import Profile
+from ..quant.html import DASH, template
+from .accuracy import LOWER_IS_BETTER, METRICS
+from .context import Published, benchmarks, context
+from .figures import figures, metrics_of
+from .figures.front import CONTEXT
+from .figures.points import told, traits
+from .figures.style import SYMBOLS
+from .palette import ACCENT, INK, ON_DARK, PALE, PROMISE, SOFT, colours
+from .report import AXIS, NAMES, RUNTIMES, UNITS, headline, name_of, number, remarks, scope
+from .result import Found, Point
+from .sensitivity import Dimension
+from .tradeoff import POINTS, Step, sentence, steps
+
+PLOTLY = "package_data/plotly.min.js"
+"""Where the package `plotly` keeps its script."""
+
+FILTERS = {
+    "precision": "precision",
+    "runtime": "runtime",
+    "latency": "evidence of FPS",
+    "accuracy": "evidence of accuracy",
+}
+"""What points can be filtered by, with what it is called."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """One value of a filter."""
+
+    value: str
+    label: str
+    checked: bool = True
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The values that a trait takes."""
+
+    key: str
+    title: str
+    boxes: tuple[Box, ...]
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a marker or a colour stands for."""
+
+    symbol: str
+    colour: str
+    label: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the table: how a point is written in it, and what it is sorted by."""
+
+    title: str
+    text: Callable[[Point], str]
+    value: Callable[[Point], float | str | None]
+    kind: Literal["number", "text"] = "number"
+
+
+def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str:
+    """The page of a search as HTML, with everything that it needs in it.
+
+    `dimensions` are those around the pick, or around the nearest where there is none.
+    """
+    published = context(profile, found.resolution)
+    base = found.selected or found.nearest
+    drawn = figures(found, dimensions, published)
+    return template(__package__, "report.html").render(
+        found=found,
+        title=headline(found, profile.title),
+        scope=scope(found),
+        base=base,
+        remarks=_labelled(remarks(found, profile)),
+        filters=filters(found, published),
+        keys=keys(found, published),
+        metrics=metrics_of(found),
+        lower_is_better=LOWER_IS_BETTER,
+        names=NAMES,
+        axes=AXIS,
+        units=POINTS,
+        sentence=sentence(found, base) if base else None,
+        steps=steps(found, base) if base else [],
+        dimensions=[(each, _changes(each)) for each in dimensions],
+        columns=COLUMNS,
+        traits=traits,
+        name_of=name_of,
+        metric=number,
+        benchmarks=benchmarks(),
+        dark=ON_DARK,
+        plotly=Markup(_plotly()),
+        data=Markup(_json(drawn, found)),
+    )
+
+
+def filters(found: Found, published: Sequence[Published]) -> list[Filter]:
+    """A box for every value that occurs; what has one value alone is no filter."""
+    own = [Filter(key, title, _boxes(found, key)) for key, title in FILTERS.items()]
+    origins = {each.origin for each in published}
+    others = tuple(
+        Box(origin, label, checked=origin == "paper")
+        for origin, (label, _) in CONTEXT.items()
+        if origin in origins
+    )
+    return [*(each for each in own if len(each.boxes) > 1), Filter("context", "published", others)]
+
+
+def keys(found: Found, published: Sequence[Published]) -> list[Key]:
+    """What colours and markers mean, as far as they occur."""
+    evidence = {point.evidence.latency for point in found.front}
+    origins = {each.origin for each in published}
+    marks = [
+        Key("star", ACCENT, "pick" if found.selected else ""),
+        Key("star", PROMISE, "prospect" if _promising(found) else ""),
+        Key("x", INK, "demoted" if found.verified and found.verified.demoted else ""),
+    ]
+    return [
+        *(key for key in marks if key.label),
+        *(Key("circle", colour, executor) for executor, colour in colours(found).items()),
+        *(Key(s, SOFT, f"FPS {each}") for each, s in SYMBOLS.items() if each in evidence),
+        *(Key(s, PALE, label) for each, (label, s) in CONTEXT.items() if each in origins),
+    ]
+
+
+def _boxes(found: Found, key: str) -> tuple[Box, ...]:
+    occurring = dict.fromkeys(traits(point)[key] for point in found.front)
+    words: dict[str, str] = dict(RUNTIMES) if key == "runtime" else {}  # type: ignore[arg-type]
+    return tuple(Box(value, words.get(value, value)) for value in occurring)
+
+
+def _promising(found: Found) -> bool:
+    return found.prospect is not None and found.prospect != found.selected
+
+
+def _labelled(lines: Iterable[tuple[str, str]]) -> list[tuple[str, list[str]]]:
+    """Lines by their labels; one without a label belongs to the label before it."""
+    found: list[tuple[str, list[str]]] = []
+    for label, text in lines:
+        if label or not found:
+            found.append((label, []))
+        found[-1][1].append(text)
+    return found
+
+
+def _changes(dimension: Dimension) -> list[tuple[str, Step]]:
+    """Each value with the step to it from the candidate's own."""
+    return [(each.value, Step(dimension.base, each.point)) for each in dimension.variations]
+
+
+def _plotly() -> str:
+    """Plotly's script as its package ships it."""
+    return (resources.files("plotly") / PLOTLY).read_text("utf-8")
+
+
+def _json(drawn: dict[str, Any], found: Found) -> str:
+    """What the page's script draws, with nothing in it that could end the element around it."""
+    data = {"figures": drawn, "texts": [told(point) for point in found.front], "dark": ON_DARK}
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _metric(name: Any) -> Column:
+    """The column of an accuracy."""
+    return Column(
+        f"{NAMES[name]},{UNITS[name] if UNITS[name] != '%' else ' %'}",
+        lambda point: DASH if point.metric(name) is None else f"{point.metric(name):.2f}",
+        lambda point: point.metric(name),
+    )
+
+
+def _number(title: str, value: Callable[[Point], float], written: str = "{:,}") -> Column:
+    return Column(title, lambda point: written.format(value(point)), value)
+
+
+def _word(title: str, value: Callable[[Point], str]) -> Column:
+    return Column(title, value, value, "text")
+
+
+COLUMNS = (
+    _number("c", lambda point: point.arch.c),
+    _number("stages", lambda point: point.arch.stages),
+    Column(
+        "branches", lambda p: p.arch.branches, lambda p: BRANCHES.index(p.arch.branches), "number"
+    ),
+    _number("d_max", lambda point: point.arch.d_max),
+    _word("3D widths", lambda point: "/".join(str(width) for width in point.arch.conv3d)),
+    _word("precision", lambda point: point.precision),
+    _word("runtime", lambda point: RUNTIMES[point.runtime]),
+    _number("FPS", lambda point: point.fps, "{:.1f}"),
+    Column("interval", lambda p: f"{p.fps_low:.1f}–{p.fps_high:.1f}", lambda p: p.fps_low),
+    _number("ms", lambda point: point.latency_ms, "{:.1f}"),
+    *(_metric(name) for name in METRICS),
+    _word("FPS is", lambda point: point.evidence.latency),
+    _word("accuracy is", lambda point: point.evidence.accuracy),
+    _number("parameters", lambda point: point.params),
+    _number("MB", lambda point: point.size_bytes / 1e6, "{:.2f}"),
+)
+"""The table of the front."""
