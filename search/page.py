@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from markupsafe import Markup
 
-from ..profiles.evidence import BRANCHES
+from ..model.arch import Precision
 from ..profiles.profile import Profile
 from ..quant.html import DASH, template
 from .accuracy import LOWER_IS_BETTER, METRICS
@@ -36,6 +36,13 @@ FILTERS = {
 }
 """What points can be filtered by, with what it is called."""
 
+VALUES: dict[str, str] = {
+    **{precision: precision for precision in get_args(Precision)},
+    **RUNTIMES,
+    **{evidence: evidence for evidence in SYMBOLS},
+}
+"""Every value that a trait can take, in order, with what it is called."""
+
 
 @dataclass(frozen=True)
 class Box:
@@ -44,6 +51,8 @@ class Box:
     value: str
     label: str
     checked: bool = True
+    symbol: str | None = None
+    """The marker of what it shows, where that has one of its own."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str
         base=base,
         remarks=_labelled(remarks(found, profile)),
         filters=filters(found, published),
-        keys=keys(found, published),
+        keys=keys(found),
         metrics=metrics_of(found),
         lower_is_better=LOWER_IS_BETTER,
         names=NAMES,
@@ -103,6 +112,7 @@ def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str
         name_of=name_of,
         metric=number,
         benchmarks=benchmarks(),
+        pale=PALE,
         dark=ON_DARK,
         plotly=Markup(_plotly()),
         data=Markup(_json(drawn, found)),
@@ -114,17 +124,16 @@ def filters(found: Found, published: Sequence[Published]) -> list[Filter]:
     own = [Filter(key, title, _boxes(found, key)) for key, title in FILTERS.items()]
     origins = {each.origin for each in published}
     others = tuple(
-        Box(origin, label, checked=origin == "paper")
-        for origin, (label, _) in CONTEXT.items()
+        Box(origin, label, checked=origin == "paper", symbol=symbol)
+        for origin, (label, symbol) in CONTEXT.items()
         if origin in origins
     )
     return [*(each for each in own if len(each.boxes) > 1), Filter("context", "published", others)]
 
 
-def keys(found: Found, published: Sequence[Published]) -> list[Key]:
+def keys(found: Found) -> list[Key]:
     """What colours and markers mean, as far as they occur."""
     evidence = {point.evidence.latency for point in found.front}
-    origins = {each.origin for each in published}
     marks = [
         Key("star", ACCENT, "pick" if found.selected else ""),
         Key("star", PROMISE, "prospect" if _promising(found) else ""),
@@ -134,14 +143,12 @@ def keys(found: Found, published: Sequence[Published]) -> list[Key]:
         *(key for key in marks if key.label),
         *(Key("circle", colour, executor) for executor, colour in colours(found).items()),
         *(Key(s, SOFT, f"FPS {each}") for each, s in SYMBOLS.items() if each in evidence),
-        *(Key(s, PALE, label) for each, (label, s) in CONTEXT.items() if each in origins),
     ]
 
 
 def _boxes(found: Found, key: str) -> tuple[Box, ...]:
-    occurring = dict.fromkeys(traits(point)[key] for point in found.front)
-    words: dict[str, str] = dict(RUNTIMES) if key == "runtime" else {}  # type: ignore[arg-type]
-    return tuple(Box(value, words.get(value, value)) for value in occurring)
+    occurring = {traits(point)[key] for point in found.front}
+    return tuple(Box(value, label) for value, label in VALUES.items() if value in occurring)
 
 
 def _promising(found: Found) -> bool:
@@ -195,9 +202,7 @@ def _word(title: str, value: Callable[[Point], str]) -> Column:
 COLUMNS = (
     _number("c", lambda point: point.arch.c),
     _number("stages", lambda point: point.arch.stages),
-    Column(
-        "branches", lambda p: p.arch.branches, lambda p: BRANCHES.index(p.arch.branches), "number"
-    ),
+    _word("branches", lambda point: point.arch.branches),
     _number("d_max", lambda point: point.arch.d_max),
     _word("3D widths", lambda point: "/".join(str(width) for width in point.arch.conv3d)),
     _word("precision", lambda point: point.precision),

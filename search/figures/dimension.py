@@ -10,7 +10,7 @@ from ..report import NAMES
 from ..result import Found
 from ..sensitivity import Dimension
 from .points import told
-from .style import SYMBOLS, Figure, Trace, axis, interval, layout, note, target
+from .style import SYMBOLS, Figure, Trace, axis, broken, interval, layout, note, target
 
 
 def dimension(found: Found, shown: Dimension) -> Figure:
@@ -20,7 +20,12 @@ def dimension(found: Found, shown: Dimension) -> Figure:
     values = [point.metric(found.objective) for point in points]
     accuracies = _marks(shown, values, [p.evidence.accuracy for p in points])
     unknown = sum(value is None for value in values)
-    title = NAMES[found.objective] + (f" (of {unknown} not known)" if unknown else "")
+    fastest = max(point.fps_high for point in points)
+    title = NAMES[found.objective]
+    if unknown:
+        title += f" ({unknown} of {len(values)} not known)"
+    names = [each.value for each in shown.variations]
+    words = {} if shown.ordered else {"tickvals": names, "ticktext": [broken(n) for n in names]}
     heading = {"x": 0, "xref": "paper", "xanchor": "left", "yref": "paper", "yanchor": "bottom"}
     return {
         "data": [
@@ -30,10 +35,18 @@ def dimension(found: Found, shown: Dimension) -> Figure:
         "layout": layout(
             290,
             {"l": 44, "r": 10, "t": 20, "b": 30},
-            xaxis=axis(type="category", anchor="y2", showgrid=False, fixedrange=True),
+            xaxis=axis(
+                type="category",
+                anchor="y2",
+                showgrid=False,
+                fixedrange=True,
+                tickangle=0,
+                nticks=9,
+                **words,
+            ),
             yaxis=axis(domain=[0.58, 1], rangemode="tozero", fixedrange=True),
             yaxis2=axis(domain=[0, 0.42], fixedrange=True),
-            shapes=[target(found.target_fps, "y")],
+            shapes=[target(found.target_fps, "y")] if found.target_fps <= fastest else [],
             annotations=[note("FPS", y=1, **heading), note(title, y=0.42, **heading)],
         ),
     }

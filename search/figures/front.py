@@ -20,18 +20,11 @@ CONTEXT: dict[Origin, tuple[str, str]] = {
 }
 """What published networks are called, and their markers."""
 
-MANTISSAS = ((1,), (1, 2, 5), (1, 2, 3, 5, 7), tuple(n / 4 for n in range(4, 40)))
-"""Frame rates that are written at the axis: those of a front over decades, or over less."""
-
-DECADES = range(-4, 7)
-
 
 def front(found: Found, metric: Metric, published: Sequence[Published]) -> Figure:
     """The figure of one metric; points of which it is unknown are missing."""
-    data = [*_context(metric, published), *_series(found, metric), *_marks(found, metric)]
-    rates = [found.target_fps, *(point.fps for point in found.front)]
+    data = [*_context(found, metric, published), *_series(found, metric), *_marks(found, metric)]
     title = {"text": "frames per second", "standoff": 8}
-    ticks = {"tickmode": "array", "tickvals": _ticks(rates)}
     goal = note(
         f"target {found.target_fps:g} FPS",
         ACCENT,
@@ -45,7 +38,7 @@ def front(found: Found, metric: Metric, published: Sequence[Published]) -> Figur
         "layout": layout(
             400,
             {"l": 44, "r": 14, "t": 26, "b": 44},
-            xaxis=axis(type="log", title=title, **ticks),
+            xaxis=axis(type="log", title=title, tickformat=".6~g", nticks=4),
             yaxis=axis(),
             shapes=[target(found.target_fps, "x")],
             annotations=[goal],
@@ -108,7 +101,7 @@ def _mark(role: str, point: Point, metric: Metric, symbol: str, colour: str) -> 
     }
 
 
-def _context(metric: Metric, published: Sequence[Published]) -> Iterable[Trace]:
+def _context(found: Found, metric: Metric, published: Sequence[Published]) -> Iterable[Trace]:
     """Published networks, hollow and pale."""
     for origin, (name, symbol) in CONTEXT.items():
         known = [each for each in published if each.origin == origin and metric in each.metrics]
@@ -120,26 +113,21 @@ def _context(metric: Metric, published: Sequence[Published]) -> Iterable[Trace]:
                 "x": [each.fps for each in known],
                 "y": [each.metrics[metric] for each in known],
                 "text": [each.name for each in known],
-                "textposition": "middle right",
+                "textposition": [_side(found, each) for each in known],
                 "textfont": {"color": SOFT, "size": 10},
+                "cliponaxis": False,
                 "hovertext": [_told(each, metric, name) for each in known],
                 "meta": {"context": origin},
                 "marker": {"symbol": symbol, "size": 11, "color": PALE, "line": {"width": 1.5}},
             }
 
 
+def _side(found: Found, network: Published) -> str:
+    """Names point to where the front is, away from the edges."""
+    return "middle left" if network.fps > found.target_fps else "middle right"
+
+
 def _told(network: Published, metric: Metric, name: str) -> str:
     value = caption(metric, network.metrics[metric])
     lines = [f"<b>{network.name}</b>", f"{network.fps:.1f} FPS, {value}", name, *network.notes]
     return "<br>".join(lines)
-
-
-def _ticks(rates: Sequence[float]) -> list[float]:
-    """The first of `MANTISSAS` of which at least four lie between the rates, in every decade."""
-    low, high = min(rates), max(rates)
-    values: list[float] = []
-    for steps in MANTISSAS:
-        values = [step * 10.0**decade for decade in DECADES for step in steps]
-        if sum(low <= value <= high for value in values) >= 4:
-            break
-    return values

@@ -9,11 +9,11 @@ from math import log
 
 from ...profiles.evidence import BRANCHES
 from ..accuracy import METRICS
-from ..palette import ACCENT, INK, PALE, colours
+from ..palette import ACCENT, CARD, INK, PALE, colours
 from ..report import NAMES, UNITS, executor_of
 from ..result import Found, Point
 from .points import Traits, groups, kind, traits
-from .style import SYMBOLS, Figure, Layout, Trace, layout, note
+from .style import SYMBOLS, Figure, Layout, Trace, broken, layout, note
 
 UNKNOWN = -0.12
 """Where a line passes an axis on which it has no value; the axes go from 0 to 1."""
@@ -103,7 +103,7 @@ def _numbers(title: str, values: Sequence[float | None]) -> Axis:
 def _words(title: str, values: Sequence[str], order: Sequence[str]) -> Axis:
     """Names as their positions among those that occur, in lines that are short."""
     occurring = [name for name in order if name in values]
-    lines = [name.replace("+", "+<br>").replace(" on ", "<br>") for name in occurring]
+    lines = [broken(name) for name in occurring]
     places = tuple(float(occurring.index(value)) for value in values)
     return Axis(title, places, lambda place: lines[int(place)])
 
@@ -143,7 +143,7 @@ def _frame(axes: Sequence[Axis], places: Places) -> Layout:
     hidden = {"visible": False, "fixedrange": True}
     return layout(
         430,
-        {"l": 8, "r": 8, "t": 44, "b": 8},
+        {"l": 8, "r": 8, "t": 50, "b": 8},
         xaxis={**hidden, "range": [-0.6, len(axes) - 0.6]},
         yaxis={**hidden, "range": [-0.17, 1.04]},
         shapes=[
@@ -152,13 +152,18 @@ def _frame(axes: Sequence[Axis], places: Places) -> Layout:
         ],
         annotations=[
             *(word for at, axis in enumerate(axes) for word in _words_of(at, axis)),
-            *(note("–", x=at, y=UNKNOWN, xanchor="right", xshift=-6) for at in missing),
+            *(_beside("–", at, UNKNOWN) for at in missing),
         ],
     )
 
 
 def _words_of(at: int, axis: Axis) -> Iterable[dict[str, object]]:
     """The title of an axis, and values beside it."""
-    yield note(f"<b>{axis.title}</b>", INK, x=at, y=1, yanchor="bottom", yshift=12)
+    yield note(f"<b>{axis.title}</b>", INK, x=at, y=1, yanchor="bottom", yshift=18)
     for place, text in axis.labels():
-        yield note(text, x=at, y=place, xanchor="right", xshift=-6)
+        yield _beside(text, at, place)
+
+
+def _beside(text: str, at: int, place: float) -> dict[str, object]:
+    """A value left of its axis, in front of the lines."""
+    return note(text, x=at, y=place, xanchor="right", xshift=-5, bgcolor=CARD, borderpad=1)

@@ -83,3 +83,8 @@ def note(text: str, color: str = SOFT, **place: Any) -> dict[str, Any]:
     """A word on a figure."""
     font = {"color": color, "size": 11}
     return {"text": text, "font": font, "showarrow": False, **place}
+
+
+def broken(name: str) -> str:
+    """A name in lines that are short enough for the foot or the side of an axis."""
+    return name.replace("+", "+<br>").replace(" on ", "<br>")
