@@ -36,10 +36,8 @@ FILTERS = {
 }
 """What points can be filtered by, with what it is called."""
 
-VALUES: dict[str, str] = {
-    **{precision: precision for precision in get_args(Precision)},
-    **RUNTIMES,
-    **{evidence: evidence for evidence in SYMBOLS},
+VALUES = {name: name for name in (*get_args(Precision), *SYMBOLS)} | {
+    str(runtime): name for runtime, name in RUNTIMES.items()
 }
 """Every value that a trait can take, in order, with what it is called."""
 

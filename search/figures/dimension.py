@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from ...profiles.evidence import Evidence
 from ..palette import ACCENT, INK, PALE
@@ -26,7 +27,8 @@ def dimension(found: Found, shown: Dimension) -> Figure:
         title += f" ({unknown} of {len(values)} not known)"
     names = [each.value for each in shown.variations]
     words = {} if shown.ordered else {"tickvals": names, "ticktext": [broken(n) for n in names]}
-    heading = {"x": 0, "xref": "paper", "xanchor": "left", "yref": "paper", "yanchor": "bottom"}
+    heading: dict[str, Any] = {"x": 0, "xref": "paper", "xanchor": "left"}
+    heading |= {"yref": "paper", "yanchor": "bottom"}
     return {
         "data": [
             {**rates, "error_y": {**interval(points), "color": PALE}},
