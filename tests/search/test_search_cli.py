@@ -21,7 +21,7 @@ from rts2.search.result import read
 from rts2.search.space import Space
 
 TX2 = ("--device", "tx2", "--target-fps", "10")
-FILES = {"front.json", "front.csv", "front.png", "deployment.json"}
+FILES = {"front.json", "front.csv", "front.png", "report.html", "deployment.json"}
 
 
 class Run:
@@ -162,6 +162,8 @@ def test_the_files_agree_with_one_another(run: Command) -> None:
     assert deployment["target_fps"] == 10.0
     assert deployment["expected"]["fps"] == found["selected"]["fps"]
     assert deployment["input"]["shape"] == [1, 3, 384, 1248]
+    shown = (done.folder / "report.html").read_text("utf-8")
+    assert f"{found['selected']['fps']:.1f} <small>FPS" in shown
     with Image.open(done.folder / "front.png") as picture:
         picture.verify()
         assert picture.width > 500
@@ -490,9 +492,10 @@ def test_a_whole_search_loads_no_heavy_library_and_says_nothing_else(tmp_path: P
 
 
 def test_importing_the_command_loads_no_library_of_pictures_either() -> None:
+    wanted = (*HEAVY, "matplotlib", "PIL", "jinja2", "plotly")
     code = (
         "import sys, rts2.search.cli;"
-        f"sys.exit(str([name for name in {(*HEAVY, 'matplotlib', 'PIL')} if name in sys.modules]))"
+        f"sys.exit(str([name for name in {wanted} if name in sys.modules]))"
     )
     done = in_a_fresh_process(code, [])
     assert done.stderr.strip() == "[]"
