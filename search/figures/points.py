@@ -37,6 +37,7 @@ def told(point: Point) -> str:
     arch, evidence = point.arch, point.evidence
     widths = "/".join(str(width) for width in arch.conv3d)
     known = [caption(metric, point.metric(metric)) for metric in METRICS]
+    judged = any(point.metric(metric) is not None for metric in METRICS)
     return "<br>".join(
         [
             f"<b>{arch.label()}</b>",
@@ -46,7 +47,7 @@ def told(point: Point) -> str:
             f"{point.latency_ms:.1f} ms a pair",
             f"{known[0]}, {known[1]}",
             f"{known[2]}, {known[3]}",
-            f"accuracy {evidence.accuracy}",
+            f"accuracy {evidence.accuracy if judged else 'not known'}",
             f"{point.params:,} parameters, {point.size_bytes / 1e6:.2f} MB",
             f"{point.macs / 1e9:.2f} billion multiply-adds",
         ]
