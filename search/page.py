@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Literal, get_args
-
-from markupsafe import Markup
+from typing import Any, get_args
 
 from ..model.arch import Precision
 from ..profiles.profile import Profile
-from ..quant.html import DASH, template
-from .accuracy import LOWER_IS_BETTER, METRICS
+from ..quant.html import template
+from .accuracy import LOWER_IS_BETTER
 from .context import Published, benchmarks, context
 from .figures import figures, metrics_of
 from .figures.front import CONTEXT
 from .figures.points import told, traits
 from .figures.style import SYMBOLS
 from .palette import ACCENT, INK, ON_DARK, PALE, PROMISE, SOFT, colours
-from .report import AXIS, NAMES, RUNTIMES, UNITS, headline, name_of, number, remarks, scope
-from .result import Found, Point
+from .report import AXIS, NAMES, RUNTIMES, headline, name_of, number, remarks, scope
+from .result import Found
 from .sensitivity import Dimension
+from .table import COLUMNS
 from .tradeoff import POINTS, Step, sentence, steps
 
 PLOTLY = "package_data/plotly.min.js"
@@ -71,16 +70,6 @@ class Key:
     label: str
 
 
-@dataclass(frozen=True)
-class Column:
-    """One column of the table: how a point is written in it, and what it is sorted by."""
-
-    title: str
-    text: Callable[[Point], str]
-    value: Callable[[Point], float | str | None]
-    kind: Literal["number", "text"] = "number"
-
-
 def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str:
     """The page of a search as HTML, with everything that it needs in it.
 
@@ -112,8 +101,8 @@ def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str
         benchmarks=benchmarks(),
         pale=PALE,
         dark=ON_DARK,
-        plotly=Markup(_plotly()),
-        data=Markup(_json(drawn, found)),
+        plotly=_plotly(),
+        data=_json(drawn, found),
     )
 
 
@@ -178,40 +167,3 @@ def _json(drawn: dict[str, Any], found: Found) -> str:
     data = {"figures": drawn, "texts": [told(point) for point in found.front], "dark": ON_DARK}
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
-
-
-def _metric(name: Any) -> Column:
-    """The column of an accuracy."""
-    return Column(
-        f"{NAMES[name]},{UNITS[name] if UNITS[name] != '%' else ' %'}",
-        lambda point: DASH if point.metric(name) is None else f"{point.metric(name):.2f}",
-        lambda point: point.metric(name),
-    )
-
-
-def _number(title: str, value: Callable[[Point], float], written: str = "{:,}") -> Column:
-    return Column(title, lambda point: written.format(value(point)), value)
-
-
-def _word(title: str, value: Callable[[Point], str]) -> Column:
-    return Column(title, value, value, "text")
-
-
-COLUMNS = (
-    _number("c", lambda point: point.arch.c),
-    _number("stages", lambda point: point.arch.stages),
-    _word("branches", lambda point: point.arch.branches),
-    _number("d_max", lambda point: point.arch.d_max),
-    _word("3D widths", lambda point: "/".join(str(width) for width in point.arch.conv3d)),
-    _word("precision", lambda point: point.precision),
-    _word("runtime", lambda point: RUNTIMES[point.runtime]),
-    _number("FPS", lambda point: point.fps, "{:.1f}"),
-    Column("interval", lambda p: f"{p.fps_low:.1f}–{p.fps_high:.1f}", lambda p: p.fps_low),
-    _number("ms", lambda point: point.latency_ms, "{:.1f}"),
-    *(_metric(name) for name in METRICS),
-    _word("FPS is", lambda point: point.evidence.latency),
-    _word("accuracy is", lambda point: point.evidence.accuracy),
-    _number("parameters", lambda point: point.params),
-    _number("MB", lambda point: point.size_bytes / 1e6, "{:.2f}"),
-)
-"""The table of the front."""
