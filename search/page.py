@@ -15,7 +15,7 @@ from .accuracy import LOWER_IS_BETTER
 from .context import Published, benchmarks, context
 from .figures import figures, metrics_of
 from .figures.front import CONTEXT
-from .figures.points import told, traits
+from .figures.points import between, told, traits
 from .figures.style import SYMBOLS
 from .palette import ACCENT, INK, ON_DARK, PALE, PROMISE, SOFT, colours
 from .report import AXIS, NAMES, RUNTIMES, headline, name_of, number, remarks, scope
@@ -85,6 +85,7 @@ def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str
         base=base,
         remarks=_labelled(remarks(found, profile)),
         filters=filters(found, published),
+        hides_extrapolated=hides_extrapolated(found),
         keys=keys(found),
         metrics=metrics_of(found),
         lower_is_better=LOWER_IS_BETTER,
@@ -98,6 +99,7 @@ def page(found: Found, profile: Profile, dimensions: Sequence[Dimension]) -> str
         traits=traits,
         name_of=name_of,
         metric=number,
+        between=between,
         benchmarks=benchmarks(),
         pale=PALE,
         dark=ON_DARK,
@@ -135,7 +137,22 @@ def keys(found: Found) -> list[Key]:
 
 def _boxes(found: Found, key: str) -> tuple[Box, ...]:
     occurring = {traits(point)[key] for point in found.front}
-    return tuple(Box(value, label) for value, label in VALUES.items() if value in occurring)
+    hidden = {"extrapolated"} if key == "accuracy" and hides_extrapolated(found) else set()
+    return tuple(
+        Box(value, label, checked=value not in hidden)
+        for value, label in VALUES.items()
+        if value in occurring
+    )
+
+
+def hides_extrapolated(found: Found) -> bool:
+    """Whether accuracies that were extrapolated appear only when asked for, as in the picture.
+
+    Not where the pick, or the nearest, rests on one.
+    """
+    base = found.selected or found.nearest
+    known = {point.evidence.accuracy for point in found.front}
+    return base is not None and base.evidence.accuracy != "extrapolated" and "extrapolated" in known
 
 
 def _promising(found: Found) -> bool:

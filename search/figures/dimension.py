@@ -11,7 +11,7 @@ from ..report import NAMES
 from ..result import Found
 from ..sensitivity import Dimension
 from .points import told
-from .style import SYMBOLS, Figure, Trace, axis, broken, interval, layout, note, target
+from .style import SYMBOLS, Figure, Trace, axis, broken, doubt, interval, layout, note, target
 
 
 def dimension(found: Found, shown: Dimension) -> Figure:
@@ -32,7 +32,11 @@ def dimension(found: Found, shown: Dimension) -> Figure:
     return {
         "data": [
             {**rates, "error_y": {**interval(points), "color": PALE}},
-            {**accuracies, "yaxis": "y2"},
+            {
+                **accuracies,
+                "yaxis": "y2",
+                "error_y": {**doubt(points, found.objective), "color": PALE},
+            },
         ],
         "layout": layout(
             290,

@@ -12,7 +12,7 @@ from ..palette import ACCENT, CARD, INK, PALE, PROMISE, SOFT, colours
 from ..report import caption, executor_of
 from ..result import Found, Point
 from .points import Traits, groups, kind, told, traits
-from .style import SYMBOLS, Figure, Trace, axis, interval, layout, note, target
+from .style import SYMBOLS, Figure, Trace, axis, doubt, interval, layout, note, target
 
 CONTEXT: dict[Origin, tuple[str, str]] = {
     "paper": ("the paper's networks on this device", "square-open"),
@@ -65,6 +65,7 @@ def _points(found: Found, metric: Metric, meta: Traits, known: Sequence[int]) ->
         "x": [point.fps for point in points],
         "y": [point.metric(metric) for point in points],
         "error_x": interval(points),
+        "error_y": doubt(points, metric),
         "customdata": list(known),
         "meta": meta,
         "opacity": 0.9 if first.proven else 0.45,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..accuracy import METRICS
-from ..report import caption, executor_of
+from ..accuracy import METRICS, Metric
+from ..report import NAMES, UNITS, executor_of, number
 from ..result import Found, Point
 
 Traits = dict[str, str]
@@ -32,11 +32,18 @@ def kind(point: Point) -> str:
     return f"{executor_of(point)}, {point.evidence.latency}"
 
 
+def between(point: Point, metric: Metric) -> str:
+    """A metric with its unit, and with its interval where one is known."""
+    text, unit = number(metric, point.metric(metric)), UNITS[metric]
+    ends = (point.ranges or {}).get(metric)
+    return f"{text} ({ends[0]:.2f}–{ends[1]:.2f}{unit})" if ends else text
+
+
 def told(point: Point) -> str:
     """Everything that a point has, for the label under the pointer."""
     arch, evidence = point.arch, point.evidence
     widths = "/".join(str(width) for width in arch.conv3d)
-    known = [caption(metric, point.metric(metric)) for metric in METRICS]
+    known = [f"{NAMES[metric]} {between(point, metric)}" for metric in METRICS]
     judged = any(point.metric(metric) is not None for metric in METRICS)
     return "<br>".join(
         [

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from ...profiles.evidence import Evidence
+from ..accuracy import Metric
 from ..palette import ACCENT, CARD, INK, LINE, PALE, SOFT
 from ..result import Point
 
@@ -54,11 +55,24 @@ def axis(**own: Any) -> dict[str, Any]:
 
 def interval(points: Sequence[Point]) -> dict[str, Any]:
     """The intervals of frame rates as error bars."""
+    return _bars([(point.fps_low, point.fps, point.fps_high) for point in points])
+
+
+def doubt(points: Sequence[Point], metric: Metric) -> dict[str, Any]:
+    """The intervals of a metric as error bars; of no length where none is known."""
+    known = [(point.ranges or {}).get(metric) for point in points]
+    values = [point.metric(metric) or 0.0 for point in points]
+    ends = [each or (value, value) for each, value in zip(known, values, strict=True)]
+    return _bars([(low, at, high) for (low, high), at in zip(ends, values, strict=True)])
+
+
+def _bars(intervals: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    """Error bars from the low end, the value and the high end of each."""
     return {
         "type": "data",
         "symmetric": False,
-        "array": [point.fps_high - point.fps for point in points],
-        "arrayminus": [point.fps - point.fps_low for point in points],
+        "array": [high - at for _, at, high in intervals],
+        "arrayminus": [at - low for low, at, _ in intervals],
         "thickness": 0.7,
         "width": 0,
     }

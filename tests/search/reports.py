@@ -49,5 +49,5 @@ def demoted() -> Found:
     known = found()
     assert known.selected is not None
     slow = known.selected.model_copy(update={"fps": 9.0, "latency_ms": 1000 / 9})
-    seen = Verified(timed=5, predicted=2, demoted=slow)
+    seen = Verified(timed=5, predicted=2, unreliable=1, demoted=slow)
     return known.model_copy(update={"verified": seen, "cost": COST})

@@ -13,7 +13,7 @@ import pytest
 from rts2.profiles.profile import Profile, load
 from rts2.search.context import context
 from rts2.search.figures import figures
-from rts2.search.page import filters, page
+from rts2.search.page import filters, hides_extrapolated, page
 from rts2.search.report import remarks
 from rts2.search.result import Found
 from rts2.search.sensitivity import Dimension
@@ -145,9 +145,19 @@ def test_the_filters_are_what_occurs_and_is_not_all_alike() -> None:
     assert known["context"] == ["paper", "benchmark"]
     for box in usual().one("form").all("input"):
         assert box.attributes["type"] == "checkbox"
-        assert ("checked" in box.attributes) == (box.attributes["value"] != "benchmark")
+        told = (box.attributes["name"], box.attributes["value"])
+        hidden = told in (("accuracy", "extrapolated"), ("context", "benchmark"))
+        assert ("checked" in box.attributes) == (not hidden)
     only = found(precisions=("fp32",), runtimes=("pytorch",))
     assert {each.key for each in filters(only, published)} == {"latency", "accuracy", "context"}
+
+
+def test_extrapolated_accuracies_are_shown_where_the_pick_rests_on_one() -> None:
+    assert hides_extrapolated(found())
+    assert found().selected is not None
+    told = found().selected.evidence.model_copy(update={"accuracy": "extrapolated"})
+    pick = found().selected.model_copy(update={"evidence": told})
+    assert not hides_extrapolated(found().model_copy(update={"selected": pick}))
 
 
 def test_the_script_gets_the_figures_as_they_are() -> None:

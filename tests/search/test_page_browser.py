@@ -23,6 +23,8 @@ const settled = () => new Promise(resolve => setTimeout(resolve, 500));
 await settled();
 seen.figures = [...document.querySelectorAll("[data-figure]")].filter(
   each => !each.querySelector(".main-svg .trace .points path")).map(each => each.dataset.figure);
+seen.first = state();
+document.querySelector(".boxes input[name=accuracy][value=extrapolated]").click(); await settled();
 seen.all = state();
 click("fp16"); await settled();
 seen.without = state();
@@ -56,7 +58,11 @@ def test_every_figure_is_drawn_and_the_filters_act_on_all_of_them(browser: Brows
     assert seen["figures"] == [], "figures without a mark"
     points = found().front
     fp32 = sum(point.precision == "fp32" for point in points)
+    hidden = sum(point.evidence.accuracy == "extrapolated" for point in points)
     assert 0 < fp32 < len(points)
+    assert seen["first"]["rows"] == len(points) - hidden
+    assert seen["first"]["front"] == seen["all"]["front"] - hidden
+    assert hidden > 0
     assert seen["all"]["rows"] == len(points)
     assert seen["all"]["told"] == f"{len(points)} of {len(points)} networks"
     without = seen["without"]

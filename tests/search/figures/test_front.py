@@ -64,6 +64,22 @@ def test_every_point_of_known_accuracy_is_drawn_once_with_the_values_of_the_json
         assert sorted(seen) == [at for at, p in enumerate(stored) if p[metric] is not None]
 
 
+def test_an_interval_of_an_accuracy_is_a_bar_and_none_has_no_length() -> None:
+    known = found()
+    assert known.selected is not None
+    at = known.front.index(known.selected)
+    doubtful = known.selected.model_copy(update={"ranges": {"d1_all": (4.25, 5.5)}})
+    points = (*known.front[:at], doubtful, *known.front[at + 1 :])
+    seen = 0
+    for trace in series(known.model_copy(update={"front": points}), "d1_all"):
+        bars = trace["error_y"]
+        ends = zip(trace["customdata"], bars["arrayminus"], bars["array"], strict=True)
+        for own, down, up in ends:
+            assert (down, up) == (pytest.approx((0.45, 0.8)) if own == at else (0, 0))
+            seen += own == at
+    assert seen == 1
+
+
 def test_an_error_and_the_miou_are_shown() -> None:
     assert metrics_of(found()) == ("d1_all", "miou")
     assert metrics_of(found(objective="epe", target_fps=6.0)) == ("epe", "miou")

@@ -2,7 +2,7 @@
 
 import json
 
-from rts2.search.figures.points import groups, told
+from rts2.search.figures.points import between, groups, told
 
 from ..reports import dimensions, found
 
@@ -28,6 +28,14 @@ def test_an_accuracy_that_nobody_knows_has_no_evidence() -> None:
     (widths,) = (each for each in dimensions() if each.name == "3D width, stage 1")
     lines = [told(each.point).split("<br>")[7] for each in widths.variations]
     assert lines == ["accuracy not known", "accuracy published"]
+
+
+def test_an_interval_stands_beside_its_metric() -> None:
+    assert found().selected is not None
+    doubtful = found().selected.model_copy(update={"ranges": {"d1_all": (4.25, 5.5)}})
+    assert between(doubtful, "d1_all") == "4.70% (4.25–5.50%)"
+    assert between(doubtful, "epe") == "–"
+    assert between(found().selected, "d1_all") == "4.70%"
 
 
 def test_groups_part_the_front() -> None:
