@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from math import prod
 
 import numpy as np
@@ -121,8 +122,9 @@ class Parts:
     shapes: dict[str, tuple[int, ...]]
 
     @classmethod
+    @lru_cache(maxsize=4)
     def of(cls, space: Space, resolution: tuple[int, int]) -> Parts:
-        """Tabulates each part over the dimensions that it depends on."""
+        """Tabulates each part over the dimensions that it depends on; the last few are kept."""
         size = padded(resolution, Arch().multiple)
         tables = dict(_tables(space, size))
         lists = [steps for table in tables.values() for steps in table.steps]
