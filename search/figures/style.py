@@ -83,7 +83,7 @@ def target(fps: float, along: Literal["x", "y"]) -> dict[str, Any]:
     across = "y" if along == "x" else "x"
     return {
         "type": "line",
-        "layer": "below",
+        "layer": "between",
         f"{along}0": fps,
         f"{along}1": fps,
         f"{across}0": 0,
