@@ -89,7 +89,7 @@ def target(fps: float, along: Literal["x", "y"]) -> dict[str, Any]:
         f"{across}0": 0,
         f"{across}1": 1,
         f"{across}ref": "paper",
-        "line": {"color": ACCENT, "width": 1, "dash": "dash"},
+        "line": {"color": ACCENT, "width": 1.5, "dash": "dash"},
     }
 
 
