@@ -3,11 +3,12 @@
 from functools import cache
 from typing import Any
 
+from rts2.model.arch import Arch
 from rts2.profiles.profile import Profile, load
 from rts2.search.exhaustive import Question, search
 from rts2.search.result import Cost, Found, Verified
 from rts2.search.sensitivity import Dimension, sensitivity
-from rts2.search.sources import source
+from rts2.search.sources import Measured, MeasuredRows, source
 from rts2.search.space import Space
 
 SPACE = Space(c=(1, 4, 8, 16), d_max=(10, 12), conv3d=((8, 16), (4,), (4,)))
@@ -42,6 +43,16 @@ def dimensions(device: str = "tx2", **asked: Any) -> tuple[Dimension, ...]:
     if base is None:
         return ()
     return sensitivity(question(device, **asked), source("published"), base, SPACE)
+
+
+@cache
+def dimensions_of_one_row() -> tuple[Dimension, ...]:
+    """Around a pick whose accuracy was measured, and no other's: 4.70%."""
+    row = {"arch": Arch(c=8, stages=2), "d1_all": 4.7}
+    table = MeasuredRows.model_validate({"schema": "rts2.accuracy/1", "rows": [row]})
+    known = search(question(), Measured(table), SPACE)
+    assert known.selected is not None
+    return sensitivity(question(), Measured(table), known.selected, SPACE)
 
 
 def demoted() -> Found:

@@ -113,10 +113,13 @@ def test_a_latency_is_that_of_the_network_alone() -> None:
     assert eight.evidence.latency == "extrapolated"
 
 
-def test_an_accuracy_that_nobody_knows_stays_unknown() -> None:
+def test_an_accuracy_that_was_carried_over_is_in_doubt_and_an_unknown_one_stays_unknown() -> None:
     widths = points(around_the_pick()["3D width, stage 1"])
-    assert widths["16"].d1_all == 4.7
-    assert (widths["8"].d1_all, widths["8"].epe, widths["8"].miou) == (None, None, None)
+    assert (widths["16"].d1_all, widths["16"].ranges) == (4.7, None)
+    assert widths["8"].evidence.accuracy == "extrapolated"
+    assert widths["8"].ranges is not None
+    assert widths["8"].ranges.keys() == {"d1_all"}
+    assert (widths["8"].epe, widths["8"].miou) == (None, None)
     assert widths["8"].fps > widths["16"].fps
 
 

@@ -4,7 +4,7 @@ from rts2.search.figures.dimension import dimension
 from rts2.search.figures.style import SYMBOLS
 from rts2.search.palette import ACCENT
 
-from ..reports import dimensions, found
+from ..reports import dimensions, dimensions_of_one_row, found
 
 
 def test_each_value_has_its_rate_and_its_accuracy() -> None:
@@ -24,7 +24,7 @@ def test_each_value_has_its_rate_and_its_accuracy() -> None:
 
 
 def test_what_nobody_knows_has_no_mark_and_is_counted() -> None:
-    (widths,) = (each for each in dimensions() if each.name == "3D width, stage 1")
+    (widths,) = (each for each in dimensions_of_one_row() if each.name == "3D width, stage 1")
     figure = dimension(found(), widths)
     assert figure["data"][1]["y"] == [None, 4.7]
     told = [note["text"] for note in figure["layout"]["annotations"]]

@@ -4,7 +4,7 @@ import json
 
 from rts2.search.figures.points import between, groups, told
 
-from ..reports import dimensions, found
+from ..reports import dimensions_of_one_row, found
 
 
 def test_everything_of_a_point_is_told() -> None:
@@ -25,9 +25,9 @@ def test_everything_of_a_point_is_told() -> None:
 
 
 def test_an_accuracy_that_nobody_knows_has_no_evidence() -> None:
-    (widths,) = (each for each in dimensions() if each.name == "3D width, stage 1")
+    (widths,) = (each for each in dimensions_of_one_row() if each.name == "3D width, stage 1")
     lines = [told(each.point).split("<br>")[7] for each in widths.variations]
-    assert lines == ["accuracy not known", "accuracy published"]
+    assert lines == ["accuracy not known", "accuracy measured"]
 
 
 def test_an_interval_stands_beside_its_metric() -> None:
