@@ -27,7 +27,7 @@ from ..model.console import (
     whole_between,
 )
 from ..model.errors import NothingFeasible, UsageError
-from ..model.files import output_folder, remove, write_bytes, write_json
+from ..model.files import existing_file, output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
 from ..profiles.here import differences
 from ..profiles.profile import Profile, Runtime, load, names
@@ -77,6 +77,8 @@ def _require_supernet(options: argparse.Namespace, weights: Path | None) -> None
     """Raises `UsageError` for a study's options without a supernet, and for one without data."""
     given = [name for name in STUDY if getattr(options, name) not in (None, False)]
     if weights is None and given:
+        if options.accuracy != "published":
+            existing_file(Path(options.accuracy), "a supernet")
         option = given[0].replace("_", "-")
         raise UsageError(
             f"--{option} is for --accuracy SUPERNET, the weights that rts2-train --supernet makes; "
@@ -116,13 +118,18 @@ def _measured(
         metrics=judge.metrics(question.objective, question.task),
         budget=options.budget or BUDGET,
     )
-    with _bar(order) as shown:
-        studied = run(order, workers, shown)
+    try:
+        with _bar(order) as shown:
+            studied = run(order, workers, shown)
+    except NothingFeasible:
+        for name in (*RESULTS, PICK, CONFIGURATION):  # what an earlier question was told
+            remove(options.out / name)
+        raise
     found = found_by(order, studied)
     for reason in studied.failed:
         logging.getLogger(__name__).warning("note: an evaluation failed: %s", reason)
     cost = Cost(
-        wall_s=perf_counter() - started,
+        wall_s=0.0,
         evaluations=studied.evaluations,
         fresh=studied.fresh,
         cache_hits=studied.recalled,
@@ -143,8 +150,7 @@ def _measured(
         arch = found.selected.arch
         origin = f"cut out of a supernet ({own.origin}), norms calibrated on {options.data}"
         save(own.network(arch), options.out / PICK, origin)
-    else:
-        remove(options.out / PICK)
+    cost = cost.model_copy(update={"wall_s": perf_counter() - started})
     return found.model_copy(update={"cost": cost}), source_of(studied)
 
 
@@ -158,11 +164,11 @@ def _bar(order: Order) -> Iterator[Shown]:
 
     console = Console(stderr=True)
     with Bar(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("networks", total=order.budget)
+        task = bar.add_task("chains", total=order.budget)
 
         def shown(at: Progress) -> None:
-            told = caption(order.metrics[0], at.best)
-            bar.update(task, completed=at.done + at.failed, description=f"networks, best {told}")
+            told, done = caption(order.metrics[0], at.best), at.done + at.failed
+            bar.update(task, completed=done, total=at.total, description=f"chains, best {told}")
 
         yield shown
 
@@ -224,11 +230,14 @@ STREETS = "streets"
 STUDY = ("data", "dataset", "split", "data_size", "budget", "workers", "storage", "verify")
 """The options of a measured search."""
 
-PICK = "pick.safetensors"
-"""The weights of a measured search's pick."""
-
 PAGE = "report.html"
 """All that was found, for people."""
+
+RESULTS = ("front.json", "front.csv", "front.png", PAGE)
+"""What every search writes."""
+
+PICK = "pick.safetensors"
+"""The weights of a measured search's pick."""
 
 
 def _add_study(described: argparse.ArgumentParser) -> None:
@@ -309,9 +318,11 @@ def _write(found: Found, question: Question, known: AccuracySource, out: Path) -
     save(found, profile.title, out / "front.png")
     dimensions = sensitivity(question, known, base) if base else ()
     write_bytes(out / PAGE, page(found, profile, dimensions).encode())
-    written = [f"{out}/", "front.json", "front.csv", "front.png", PAGE]
+    written = [f"{out}/", *RESULTS]
     if found.cost is not None and found.selected is not None:
         written.append(PICK)
+    else:
+        remove(out / PICK)
     if found.selected is None:
         remove(out / CONFIGURATION)
         return written

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from math import exp, log1p
 from statistics import NormalDist
 from typing import NamedTuple, TypedDict
@@ -31,7 +30,7 @@ from ..profiles.parts import PartModel
 from ..profiles.profile import Calibration, Profile, Resolution, Runtime
 from ..profiles.profile import Point as Timing
 from .accuracy import LOWER_IS_BETTER, METRICS, Accuracy, AccuracySource, Metric, bounded, unbounded
-from .front import fastest, nondominated, pick
+from .front import fastest, pick, unbeaten
 from .lowered import Lowered, measured
 from .result import Coverage, Found, LeftOut, Point, PointEvidence, Task
 from .space import Parts, Space
@@ -538,7 +537,7 @@ def _front(
     accuracy = direction * metrics[:, METRICS.index(question.objective)]
     if question.at_lower_bound:
         latency = latency * np.exp(np.concatenate([columns.half_width for columns in found]))
-    kept = _unbeaten(np.column_stack([latency, accuracy]), evidence == EXTRAPOLATED)
+    kept = unbeaten(np.column_stack([latency, accuracy]), evidence == EXTRAPOLATED)
     points: list[Point] = []
     start = 0
     for columns in found:
@@ -547,19 +546,6 @@ def _front(
         points += _points(question, totals, executors, columns, own)
         start = stop
     return sorted(points, key=lambda point: -point.fps)
-
-
-def _unbeaten(objectives: Floats, doubtful: Flags) -> Flags:
-    """Which of (n, 2) objectives and (n, 2) doubts no other beats: first among those of like
-    doubts, which leaves few, then among all.
-    """
-    kept = np.zeros(len(objectives), dtype=bool)
-    for alike in product((False, True), repeat=2):
-        own = np.flatnonzero((doubtful == alike).all(axis=1))
-        kept[own] = nondominated(objectives[own])
-    left = np.flatnonzero(kept)
-    kept[left] = nondominated(np.column_stack([objectives[left], doubtful[left]]))
-    return kept
 
 
 def _points(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import product
 
 import moocore
 import numpy as np
@@ -21,6 +22,19 @@ def nondominated(objectives: Floats) -> NDArray[np.bool_]:
     if len(objectives) == 0:
         return np.zeros(0, dtype=bool)
     return np.asarray(moocore.is_nondominated(np.ascontiguousarray(objectives)), dtype=bool)
+
+
+def unbeaten(objectives: Floats, doubtful: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of (n, 2) objectives and (n, 2) doubts no other beats: first among those of like
+    doubts, which leaves few, then among all.
+    """
+    kept = np.zeros(len(objectives), dtype=bool)
+    for alike in product((False, True), repeat=2):
+        own = np.flatnonzero((doubtful == alike).all(axis=1))
+        kept[own] = nondominated(objectives[own])
+    left = np.flatnonzero(kept)
+    kept[left] = nondominated(np.column_stack([objectives[left], doubtful[left]]))
+    return kept
 
 
 def pick(

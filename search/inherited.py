@@ -31,7 +31,7 @@ from ..model.metrics import Score
 from ..model.ops import padded
 from ..model.predictor import cut_back, enlarged, prepared
 from ..model.rts2net import RTS2Net, Stage
-from ..model.supernet import extract, outside, recalibrate
+from ..model.supernet import extract, recalibrate
 from .accuracy import Row
 
 BATCH: Final = 4
@@ -106,10 +106,6 @@ class Inherited:
                 found.update(f"{name} {array.dtype} {array.shape}".encode())
                 found.update(np.ascontiguousarray(array).tobytes())
         return found.hexdigest()
-
-    def outside(self, arch: Arch) -> list[str]:
-        """What keeps the supernet from holding `arch`; empty where it does."""
-        return outside(arch, self.arch)
 
     def rows(self, arch: Arch) -> tuple[Row, ...]:
         """The accuracy of `arch` and of every network that it holds: fewer stages or branches.

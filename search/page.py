@@ -117,7 +117,10 @@ def filters(found: Found, published: Sequence[Published]) -> list[Filter]:
         for origin, (label, symbol) in CONTEXT.items()
         if origin in origins
     )
-    return [*(each for each in own if len(each.boxes) > 1), Filter("context", "published", others)]
+    return [
+        *(each for each in own if len(each.boxes) > 1),
+        Filter("context", "other networks", others),
+    ]
 
 
 def keys(found: Found) -> list[Key]:

@@ -16,7 +16,6 @@ from .palette import ACCENT, COLOURS, INK, PALE, PROMISE
 from .report import AXIS, caption, executor_of, headline
 from .result import Found, Point
 
-"""One for each runtime and precision of the proven points, where there are several."""
 MARKERS: dict[Evidence, str] = {
     "published": "s",
     "measured": "D",
@@ -50,6 +49,8 @@ def draw(found: Found, title: str) -> Figure:
         _mark(axes, found, found.verified.demoted, "demoted, misses the target", INK, "X")
     _series(axes, found, proven, INK)
     _series(axes, found, promised, PROMISE)
+    if not found.front:
+        axes.text(0.5, 0.5, "no candidate is left", ha="center", transform=axes.transAxes)
     axes.axvline(found.target_fps, color=ACCENT, linestyle="--", linewidth=1)
     axes.text(
         found.target_fps,

@@ -223,12 +223,14 @@ def _untried(found: Found) -> list[tuple[str, str]]:
         found.selected and loss(best, found.objective) >= loss(found.selected, found.objective)
     ):
         return []
-    low, high = (best.ranges or {}).get(found.objective, (0.0, 0.0))
-    between = f"{number(found.objective, low)}–{number(found.objective, high)}, extrapolated"
+    known = (best.ranges or {}).get(found.objective)
+    ends = "–".join(number(found.objective, end) for end in known) + ", " if known else ""
+    between = f"{ends}extrapolated"
     widths = "/".join(map(str, best.arch.conv3d))
     shape = f"d_max {best.arch.d_max}, 3D {widths}"
     told = f"{_sentence(found, best)} ({between}); {shape}"
-    remedy = "rts2-train --supernet, then --accuracy SUPERNET, measures it on your images"
+    lowered = " --verify" if best.precision != "fp32" else ""
+    remedy = f"rts2-train --supernet, then --accuracy SUPERNET{lowered}, measures it on your images"
     return [("untried", told), ("", remedy)]
 
 
@@ -251,7 +253,7 @@ def _cost(found: Found) -> list[tuple[str, str]]:
     """What measuring took, and what timing changed."""
     lines = []
     if (seen := found.verified) is not None:
-        told = f"{seen.timed} points measured on this device"
+        told = f"{seen.timed or 'no'} points measured on this device"
         if seen.unreliable:
             told += f", {seen.unreliable} while it was busy, whose latencies stay predictions"
         if seen.predicted:
@@ -264,7 +266,7 @@ def _cost(found: Found) -> list[tuple[str, str]]:
         workers = "1 worker" if cost.workers == 1 else f"{cost.workers} workers"
         told = (
             f"{cost.evaluations} of {cost.candidates:,} chains judged ({cost.fresh} in this run, "
-            f"{cost.cache_hits} known from before, {cost.failed} failed) by {workers}; "
+            f"{cost.cache_hits} told by the cache on disk, {cost.failed} failed) by {workers}; "
             f"{cost.wall_s:.0f} s now, evaluations {cost.evaluation_s:.0f} s in all"
         )
         if cost.training_s is not None:

@@ -203,7 +203,8 @@ class FrontSampler(BaseSampler):
 
     def taken(self, trial: FrozenTrial) -> int | None:
         """The chain of a trial, unless it is free because its worker was lost or came second."""
-        values = trial.params or trial.system_attrs.get("fixed_params", {})
+        # First what was chosen as a whole: parameters are stored one after the other.
+        values = trial.system_attrs.get("fixed_params") or trial.params
         lost = trial.state == TrialState.FAIL and REASON not in trial.user_attrs
         if lost or trial.state == TrialState.PRUNED or len(values) < len(self.chains.axes):
             return None

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
+from math import inf
 from typing import Final, Literal, Protocol
 
 import optuna
@@ -100,6 +101,8 @@ class Progress:
 
     done: int
     failed: int
+    total: int
+    """How many there are to judge."""
     best: float | None
     """The best value of the first metric among networks that meet the target."""
 
@@ -145,10 +148,7 @@ class Work:
         chains = Chains.of(self.judge.arch, order.space)
         self.landscape = Landscape.of(order.question, chains, order.metrics)
         if not len(self.landscape.admitted):
-            raise NothingFeasible(
-                f"no network that the supernet holds meets {order.question.target_fps:g} FPS on "
-                f"{order.question.profile.title}, and none was judged; lower the target"
-            )
+            raise NothingFeasible(_none_admitted(order.question))
         first = _analytic(order.question, chains)
         self.sampler = FrontSampler(self.landscape, order.metrics, first)
         self.study, self._storage = _joined(name_of(order, self.judge.digest), order, self.sampler)
@@ -158,7 +158,7 @@ class Work:
     def run(self, shown: Shown = unseen) -> None:
         """Judges one chain after another until the budget is spent or nothing is left."""
         self._free_lost()
-        while not self._spent():
+        while not self.spent():
             shown(self.progress())
             with reached(self.order.storage):
                 if self._queued():
@@ -175,7 +175,7 @@ class Work:
         metric = self.order.metrics[0]
         better = min if LOWER_IS_BETTER[metric] else max
         best = better((trial.values[1] for trial in finished), default=None)
-        return Progress(len(finished), len(self._reasons()), best)
+        return Progress(len(finished), len(self._reasons()), self._total(), best)
 
     def studied(self, before: int) -> Studied:
         """What the study came to; so many trials were finished `before` this run.
@@ -212,9 +212,13 @@ class Work:
         """The trials that spend the budget: judged, failed for a reason, running or in line."""
         return [trial for trial in self._trials() if self.sampler.taken(trial) is not None]
 
-    def _spent(self) -> bool:
+    def spent(self) -> bool:
+        """Whether nothing is left to judge."""
         done = sum(trial.state.is_finished() for trial in self._counting())
-        return done >= min(self.order.budget, len(self.landscape.admitted))
+        return done >= self._total()
+
+    def _total(self) -> int:
+        return min(self.order.budget, len(self.landscape.admitted))
 
     def _queued(self) -> bool:
         """Puts the next chain in line; whether there is one that a worker can take."""
@@ -294,6 +298,23 @@ class Work:
                     continue  # another worker was faster
 
 
+def _none_admitted(question: Question) -> str:
+    """Why no chain is worth judging."""
+    limits = {
+        "--max-size-mb": question.max_size_bytes < inf,
+        "--min-depth": question.min_disparity > 0,
+        "--precision": bool(question.precisions),
+        "--runtime": bool(question.runtimes),
+    }
+    asked = [option for option, given in limits.items() if given]
+    within = f" within {' and '.join(asked)}" if asked else ""
+    return (
+        f"no network that the supernet holds meets {question.target_fps:g} FPS on "
+        f"{question.profile.title}{within}, and none was judged; lower the target"
+        + (" or ask for less" if asked else "")
+    )
+
+
 def run(order: Order, workers: int = 1, shown: Shown = unseen) -> Studied:
     """Runs the study with so many workers on this machine, until its budget is spent.
 
@@ -301,7 +322,7 @@ def run(order: Order, workers: int = 1, shown: Shown = unseen) -> Studied:
     """
     own = Work(order)
     before = own.progress().done
-    with _beside(order, workers - 1):
+    with _beside(order, 0 if own.spent() else workers - 1):
         own.run(shown)
     return own.studied(before)
 
@@ -356,7 +377,7 @@ def _work(order: Order) -> None:
     """What a further process does; a fault of the study, the first process meets too."""
     try:
         Work(order).run()
-    except Rts2Error as error:
+    except Exception as error:
         logging.getLogger(__name__).warning("a worker ended: %s", one_line(error))
 
 

@@ -141,8 +141,10 @@ class _Graphs:
 
     def lowered(self, size: Resolution) -> Path:
         """The graph with its usual layers in integers."""
-        model, header = opened(self.float(size))
         path = self.folder / "integers-{}x{}.onnx".format(*size)
+        if path.exists():
+            return path
+        model, header = opened(self.float(size))
         made = integers(model, usual(model), self._ranges)
         save_graph(made, header.model_copy(update={"precision": "int8"}), path)
         return path

@@ -14,9 +14,9 @@ from ..model.errors import UsageError
 from ..model.machine import cores
 from ..profiles.here import elsewhere
 from ..profiles.profile import Profile
-from .accuracy import LOWER_IS_BETTER, METRICS
+from .accuracy import METRICS
 from .exhaustive import Question, choices
-from .front import nondominated
+from .front import loss, unbeaten
 from .result import Found, Point, Verified
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ def verified(found: Found, question: Question, trying: Trying) -> Found:
     unreliable = sum(each is not None and not each.timing.reliable for _, each in tried)
     front = [_measured(point, each, found.confidence) for point, each in tried]
     timed = sum(point.evidence.latency == "measured" for point in front)
-    chosen = choices(question, _kept(front, found))
+    kept = _kept(front, question)
     again = next((p for p in front if found.selected and _same(p, found.selected)), None)
-    missed = again is not None and again.fps < question.target_fps
+    missed = again is not None and _holding_fps(again, question) < question.target_fps
     told = Verified(
         timed=timed,
         unreliable=unreliable,
@@ -50,7 +50,7 @@ def verified(found: Found, question: Question, trying: Trying) -> Found:
         demoted=again if missed else None,
     )
     return found.model_copy(
-        update={"front": tuple(_kept(front, found)), **chosen, "verified": told}
+        update={"front": tuple(kept), **choices(question, kept), "verified": told}
     )
 
 
@@ -90,14 +90,23 @@ def _figures(score: Score) -> dict[str, float | None]:
     return {metric: getattr(score, metric) for metric in METRICS}
 
 
-def _kept(front: list[Point], found: Found) -> list[Point]:
-    """What no other point beats, by falling FPS."""
-    direction = 1 if LOWER_IS_BETTER[found.objective] else -1
-    losses = [direction * (point.metric(found.objective) or 0.0) for point in front]
-    promised = [not point.proven for point in front]
-    kept = nondominated(np.column_stack([[p.latency_ms for p in front], losses, promised]))
+def _kept(front: list[Point], question: Question) -> list[Point]:
+    """What no other point beats, by falling FPS; by the rules of the search."""
+    objectives = [
+        (1 / _holding_fps(point, question), loss(point, question.objective)) for point in front
+    ]
+    doubtful = [
+        (point.evidence.latency == "extrapolated", point.evidence.accuracy == "extrapolated")
+        for point in front
+    ]
+    kept = unbeaten(np.array(objectives).reshape(-1, 2), np.array(doubtful, bool).reshape(-1, 2))
     chosen = [point for point, keep in zip(front, kept, strict=True) if keep]
     return sorted(chosen, key=lambda point: -point.fps)
+
+
+def _holding_fps(point: Point, question: Question) -> float:
+    """The frame rate that must meet the target."""
+    return point.fps_low if question.at_lower_bound else point.fps
 
 
 def _same(one: Point, other: Point) -> bool:

@@ -25,11 +25,9 @@ from rts2.search.exhaustive import (
     Question,
     _Block,
     _Totals,
-    _unbeaten,
     executors_of,
     search,
 )
-from rts2.search.front import nondominated
 from rts2.search.lowered import Lowered, LoweredRows, Row
 from rts2.search.result import Found
 from rts2.search.sources import source
@@ -823,14 +821,3 @@ def test_timings_of_another_family_do_not_widen_what_is_known() -> None:
         asked = Question(known, 1, task="stereo", runtimes=("pytorch",), precisions=("fp32",))
         found = search(asked, PUBLISHED, space)
         assert {point.evidence.latency for point in found.front} == {"extrapolated"}
-
-
-@pytest.mark.parametrize("count", [0, 5, 2000])
-def test_what_no_other_beats_is_the_same_in_two_steps(count: int) -> None:
-    """Rounded, so that many are equal; the first of equals stays."""
-    chance = np.random.default_rng(count)
-    for _ in range(20):
-        objectives = np.round(chance.random((count, 2)), 2)
-        doubtful = chance.random((count, 2)) < 0.5
-        expected = nondominated(np.column_stack([objectives, doubtful]))
-        assert np.array_equal(_unbeaten(objectives, doubtful), expected)

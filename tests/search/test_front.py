@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rts2.model.arch import Arch
 from rts2.profiles.evidence import Evidence
 from rts2.search.accuracy import Metric
-from rts2.search.front import fastest, loss, nondominated, pick
+from rts2.search.front import fastest, loss, nondominated, pick, unbeaten
 from rts2.search.result import Point, PointEvidence
 
 
@@ -163,3 +163,14 @@ def test_proven_is_neither_number_extrapolated(
     latency: Evidence, accuracy: Evidence, proven: bool
 ) -> None:
     assert point(10, latency=latency, accuracy=accuracy).proven is proven
+
+
+@pytest.mark.parametrize("count", [0, 5, 2000])
+def test_what_no_other_beats_is_the_same_in_two_steps(count: int) -> None:
+    """Rounded, so that many are equal; the first of equals stays."""
+    chance = np.random.default_rng(count)
+    for _ in range(20):
+        objectives = np.round(chance.random((count, 2)), 2)
+        doubtful = chance.random((count, 2)) < 0.5
+        expected = nondominated(np.column_stack([objectives, doubtful]))
+        assert np.array_equal(unbeaten(objectives, doubtful), expected)

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from functools import cache
 from typing import Any
 
@@ -194,3 +195,13 @@ def read_back(line: dict[str, str]) -> Point:
 def test_the_spreadsheet_of_an_empty_front_is_its_header() -> None:
     (line,) = as_csv(found(min_disparity=1e6)).splitlines()
     assert line.startswith("family,c,stages,d_max,conv3d,branches,precision,runtime,latency_ms,fps")
+
+
+def test_what_is_untried_tells_an_interval_where_one_is_known() -> None:
+    """Class scores see no 3D width: their mIoU is in no doubt by it, and no zero stands for that."""
+    device = load("cpu")
+    told = printed(found(profile=device, target_fps=10.0, objective="miou"), device, 200)
+    (line,) = (line for line in told.splitlines() if line.startswith("untried"))
+    assert "(extrapolated)" in line
+    d1 = printed(found(profile=device, target_fps=10.0), device, 200)
+    assert re.search(r"untried .* \(\d+\.\d+%–\d+\.\d+%, extrapolated\)", d1)

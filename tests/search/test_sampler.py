@@ -167,3 +167,16 @@ def test_a_twentieth_of_the_chains_comes_nearer_to_the_front_than_chance() -> No
     rng = np.random.default_rng(0)
     chance = [volume(rng.choice(list(points), 45, replace=False).tolist()) for _ in range(5)]
     assert volume(chosen(FrontSampler(known, METRICS), 45)) > max(chance)
+
+
+def test_a_chain_is_taken_while_its_values_are_stored_one_by_one() -> None:
+    """Another worker may look between the first parameter and the last."""
+    sampler = FrontSampler(landscape(), METRICS)
+    study = optuna.create_study(directions=["minimize"] * 3)
+    values = sampler.chains.values(3)
+    study.enqueue_trial(values)
+    trial = study.ask()
+    assert sampler.taken(study.get_trials()[0]) == 3
+    name, axis = next(iter(sampler.chains.axes.items()))
+    trial.suggest_categorical(name, axis)
+    assert sampler.taken(study.get_trials()[0]) == 3

@@ -64,6 +64,7 @@ def test_the_pick_its_weights_and_the_cost(
     ("arguments", "told"),
     [
         (["--budget", "3"], "--budget is for --accuracy SUPERNET"),
+        (["--accuracy", "nope.safetensors", *STREETS], "nope.safetensors: there is no such file"),
         (["--verify"], "--verify is for --accuracy SUPERNET"),
         (["--accuracy", "SUPERNET"], "is judged on your data; give --data DIR"),
         (["--accuracy", "SUPERNET", *STREETS, "--budget", "0"], "from 1 to 1000000, not '0'"),
@@ -85,6 +86,21 @@ def test_what_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert told in error
     assert error.count("\n") == 1
+
+
+def test_nothing_of_an_earlier_question_stays(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ("--out", str(tmp_path))
+    measured = ("--accuracy", str(weights), *STREETS, "--budget", "1")
+    assert search([*CPU, *measured, *out]) == 0
+    assert (tmp_path / "pick.safetensors").is_file()
+    assert search([*CPU, *out]) == 0
+    assert not (tmp_path / "pick.safetensors").exists()
+    assert search([*CPU, *measured, "--max-size-mb", "0.0001", *out]) == 3
+    told = capsys.readouterr().err
+    assert "within --max-size-mb, and none was judged; lower the target or ask for less" in told
+    assert not {path.name for path in tmp_path.iterdir()} - {"judged", "study.db"}
 
 
 def test_one_network_is_no_supernet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

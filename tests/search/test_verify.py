@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from rts2.model.arch import Arch
@@ -93,6 +94,28 @@ def test_a_busy_machine_tells_nothing_of_a_latency(by_parts: Profile) -> None:
     assert told.selected.fps == same.fps
     assert told.selected.d1_all == 18.0
     assert "while it was busy" in dict(_cost(told))["verified"]
+
+
+def test_the_lower_bound_must_hold_where_the_question_asks_for_it(by_parts: Profile) -> None:
+    """Timed as fast as promised, but not surely so: the pick is demoted, as a search would."""
+    question, found = asked(by_parts)
+    strict = replace(question, at_lower_bound=True)
+    assert found.selected is not None
+
+    def unsure(point: Point) -> Tried:
+        quiet = taking(1.0, point)
+        spread = np.linspace(0.95, 1.05, 20) * point.latency_ms
+        return replace(quiet, timing=replace(quiet.timing, times_ms=tuple(spread)))
+
+    told = verified(found, strict, unsure)
+    assert told.verified is not None
+    assert told.verified.demoted is not None
+    assert told.verified.demoted.fps_low < question.target_fps <= told.verified.demoted.fps
+    assert told.selected is not None
+    assert told.selected.fps_low >= question.target_fps
+    assert verified(found, question, unsure).verified == told.verified.model_copy(
+        update={"demoted": None}
+    )
 
 
 def never(point: Point) -> Tried:
