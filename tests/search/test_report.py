@@ -198,10 +198,11 @@ def test_the_spreadsheet_of_an_empty_front_is_its_header() -> None:
 
 
 def test_what_is_untried_tells_an_interval_where_one_is_known() -> None:
-    """Class scores see no 3D width: their mIoU is in no doubt by it, and no zero stands for that."""
+    """Class scores see no 3D width, so that the mIoU is in no doubt by it."""
     device = load("cpu")
-    told = printed(found(profile=device, target_fps=10.0, objective="miou"), device, 200)
+    by_miou = search(Question(device, 10.0, objective="miou"), source("published"))
+    told = printed(by_miou, device, 200)
     (line,) = (line for line in told.splitlines() if line.startswith("untried"))
     assert "(extrapolated)" in line
-    d1 = printed(found(profile=device, target_fps=10.0), device, 200)
+    d1 = printed(search(Question(device, 10.0), source("published")), device, 200)
     assert re.search(r"untried .* \(\d+\.\d+%–\d+\.\d+%, extrapolated\)", d1)
