@@ -51,7 +51,7 @@ from rts2.model.machine import cores, processor
 from rts2.model.ops import ops, padded
 from rts2.model.predictor import OnnxPredictor, Predictor, TorchPredictor
 from rts2.model.qdq import integers, usual
-from rts2.model.volume import PLAIN, Matching
+from rts2.model.volume import PLAIN
 from rts2.profiles.runtimes import available, open_session, precisions
 from rts2.profiles.timing import Reference, Timing, measure
 from rts2.quant.calibration import calibrate
@@ -188,7 +188,7 @@ class Bench:
 
     def _graph(self, runtime: str) -> Path:
         """The float graph in the forms that a runtime is fastest at."""
-        paths = [self._source.graph(forms) for forms in FORMS]
+        paths = [self._source.graph(forms, runtime) for forms in FORMS]
         ratios = race([Runner(path, "fp32", runtime) for path in paths], cores())
         return paths[int(np.argmin(ratios))]
 
@@ -242,7 +242,7 @@ def eager(title: str, network: Network) -> Contender:
 def straightforward(network: Network) -> Network:
     """A copy of AnyNet that builds its volumes as its release does."""
     copy: Any = deepcopy(network)
-    copy.matching = Matching(plane_by_plane, sampled, PLAIN.soft_argmin)
+    copy.matching = PLAIN._replace(first_volume=plane_by_plane, residual_volume=sampled)
     return copy  # type: ignore[no-any-return]
 
 

@@ -82,7 +82,6 @@ class AnyNet(nn.Module):
     def forward(self, left: Tensor, right: Tensor, stages: int | None = None) -> list[Stage]:
         """(B, 3, H, W) twice, sides multiples of 16 → one `Stage` per stage, at full resolution."""
         depth, matching = self.arch.up_to(stages).stages, self.matching
-        size = left.shape[-2:]
         batch = left.shape[0]
         found: list[Stage] = []
         for stage, features in enumerate(self.features(torch.cat([left, right]), depth)):
@@ -95,7 +94,7 @@ class AnyNet(nn.Module):
                 volume = matching.residual_volume(left_features, right_features, around).flip(1)
             volume = self.regularize[stage](volume)
             step = matching.soft_argmin(volume, 0 if stage == 0 else -RADIUS) * stride
-            disparity = _resized(step, size)
+            disparity = matching.enlarge(step, stride)
             found.append(Stage(disparity + found[-1].disparity if found else disparity))
         return found
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from .arch import STRIDES, Form
 from .checkpoint import Network
 from .errors import UsageError
-from .forms import class_ids, formed, forms_run, rewritten
+from .forms import formed, forms_run, rewritten, steps_for
 from .graph import DISPARITY, SEMANTIC, GraphHeader, read_header, save_graph
 from .layers import enlarge
 from .ops import padded
@@ -63,29 +63,33 @@ class Deployed(nn.Module):
         return self._answer(self.network(left, right, self.arch.stages)[-1])
 
     def _answer(self, stage: Stage) -> tuple[Tensor, ...]:
-        disparity = self._full(stage.best).flatten(0, 1)
+        disparity = self._disparity(stage.best).flatten(0, 1)
         if stage.scores is None:
             return (disparity,)
         return disparity, self._classes(stage.scores)
 
-    def _classes(self, scores: Tensor) -> Tensor:
-        return self._full(scores).argmax(1).int()
+    def _disparity(self, best: Tensor) -> Tensor:
+        return best if self.factor == 1 else enlarge(best, self.factor)
 
-    def _full(self, maps: Tensor) -> Tensor:
-        return maps if self.factor == 1 else enlarge(maps, self.factor)
+    def _classes(self, scores: Tensor) -> Tensor:
+        return enlarge(scores, self.factor).argmax(1).int()
 
 
 class Exported(Deployed):
-    """The same as a graph holds it: in forms that give the same and are faster there.
+    """The same as a graph for a runtime holds it: in forms that give the same and are faster there.
 
     Behind the answer it tells those of the earlier stages, as `GraphHeader.answers` has them.
     """
 
     def __init__(
-        self, network: Network, stages: int | None = None, forms: Sequence[Form] | None = None
+        self,
+        network: Network,
+        stages: int | None = None,
+        forms: Sequence[Form] | None = None,
+        runtime: str = "onnxruntime",
     ) -> None:
         super().__init__(network, stages, forms)
-        self.network = rewritten(self.network)
+        self.network, self.steps = rewritten(self.network, runtime), steps_for(runtime)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
         *earlier, last = self.network(left, right, self.arch.stages)
@@ -94,8 +98,11 @@ class Exported(Deployed):
             maps for pair in told for maps in pair if maps is not None
         )
 
+    def _disparity(self, best: Tensor) -> Tensor:
+        return best if self.factor == 1 else self.steps.matching.enlarge(best, self.factor)
+
     def _classes(self, scores: Tensor) -> Tensor:
-        return class_ids(scores, self.factor)
+        return self.steps.class_ids(scores, self.factor)
 
 
 def export(
@@ -106,13 +113,15 @@ def export(
     opset: int = OPSET,
     stages: int | None = None,
     forms: Sequence[Form] | None = None,
+    runtime: str = "onnxruntime",
 ) -> GraphHeader:
     """Writes the network as ONNX for one resolution (W, H), batch 1, all shapes static.
 
     Inputs `left` and `right` are (1, 3, H, W), normalised, at the padded size; outputs are
     `disparity` (1, H, W) float32 and, with a semantic branch, `semantic` (1, H, W) int32. Constants
     are folded, the operators are ONNX's own, and equal arguments give equal bytes. `forms` tells
-    for each stage of the network how its 3D convs are held (see `formed`): all 3d without it.
+    for each stage of the network how its 3D convs are held (see `formed`): all 3d without it. Every
+    runtime reads every graph; it is in the steps that suit `runtime` (see `steps_for`).
 
     Raises:
         UsageError: the arch has fewer stages, the opset is none of `OPSETS`, or the forms are not
@@ -120,7 +129,7 @@ def export(
     """
     if opset not in OPSETS:
         raise UsageError(f"opset must be {OPSETS[0]} to {OPSETS[-1]}, not {opset}")
-    deployed = Exported(network, stages, forms).eval()
+    deployed = Exported(network, stages, forms, runtime).eval()
     height, width = padded(resolution, deployed.arch.multiple)
     header = GraphHeader(
         arch=deployed.arch,

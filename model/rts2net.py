@@ -100,7 +100,7 @@ class Volume(nn.Module):
         left, right = embedded.chunk(2)
         if before is None:
             return self.matching.first_volume(left, right, self.planes), None
-        around = enlarge(before, 2)
+        around = self.matching.enlarge(before, 2)
         at = around / STRIDES[self.stage]
         return self.matching.residual_volume(left, right, at), around
 

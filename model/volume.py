@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .arch import RADIUS
+from .layers import enlarge
 
 
 def first_volume(left: Tensor, right: Tensor, planes: int) -> Tensor:
@@ -87,8 +88,14 @@ class SoftArgmin(Protocol):
     def __call__(self, cost: Tensor, first: int) -> Tensor: ...
 
 
+class Enlarge(Protocol):
+    """What `rts2.model.layers.enlarge` is, of maps of one channel."""
+
+    def __call__(self, maps: Tensor, factor: int) -> Tensor: ...
+
+
 class Matching(NamedTuple):
-    """How a network computes its volumes and what it reads from them.
+    """How a network computes its volumes, what it reads from them, and how that is enlarged.
 
     The same values can be had in other steps, which other runtimes are faster at; networks are
     trained with `PLAIN`.
@@ -97,6 +104,7 @@ class Matching(NamedTuple):
     first_volume: FirstVolume
     residual_volume: ResidualVolume
     soft_argmin: SoftArgmin
+    enlarge: Enlarge
 
 
-PLAIN = Matching(first_volume, residual_volume, soft_argmin)
+PLAIN = Matching(first_volume, residual_volume, soft_argmin, enlarge)

@@ -138,7 +138,7 @@ class Bench:
     def _reference(self) -> Reference:
         from .runtimes import open_session
 
-        path = self._exported(*REFERENCE, "reference")
+        path = self._exported(*REFERENCE, "reference", runtime="onnxruntime")
         return Reference(open_session("onnxruntime", path, "fp32", self.threads).run)
 
     @property
@@ -162,7 +162,7 @@ class Bench:
         """The network's file; the one before is kept, for its other precisions."""
         known = job.arch, job.resolution, job.forms
         if self._last != known:
-            self._exported(job.arch, job.resolution, "network", job.forms)
+            self._exported(job.arch, job.resolution, "network", job.forms, runtime=self.runtime)
             self._last = known
             release_memory()
         path = self._folder / "network.onnx"
@@ -185,12 +185,14 @@ class Bench:
         resolution: Resolution,
         name: str,
         forms: tuple[Form, ...] | None = None,
+        *,
+        runtime: Runtime,
     ) -> Path:
         from ..model.checkpoint import build
         from ..model.export import export
 
         path = self._folder / f"{name}.onnx"
-        export(build(arch), path, resolution, UNTRAINED, forms=forms)
+        export(build(arch), path, resolution, UNTRAINED, forms=forms, runtime=runtime)
         return path
 
     def _opened(self, path: Path, precision: Precision) -> Session:

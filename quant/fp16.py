@@ -79,10 +79,15 @@ def _role(node: onnx.NodeProto, above: list[Role], grows: bool, constants: set[s
         return None
     if above[0] == "soft-argmin":
         return "disparity" if node.op_type in END else "soft-argmin"
-    if grows and node.op_type != "Resize":
+    if grows and not _enlarges(node, above):
         return None
     from_columns = node.op_type == "Sub" and node.input[0] in constants
     return "coordinate" if from_columns or "coordinate" in above else "disparity"
+
+
+def _enlarges(node: onnx.NodeProto, above: list[Role]) -> bool:
+    """Whether what grows is a map enlarged: by a resize, or by products of a disparity."""
+    return node.op_type == "Resize" or (node.op_type == "MatMul" and above == ["disparity"])
 
 
 def to_fp16(model: onnx.ModelProto) -> onnx.ModelProto:

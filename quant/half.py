@@ -80,7 +80,8 @@ def quantize(
         raise UsageError(f"this processor does not compute in {precision}; {instead}")
     graphs = {forms: source.graph(forms or None) for forms in source.forms or ((),)}
     plain = _fastest([Runner(path, "fp32") for path in graphs.values()], threads)
-    lowered = {path.with_suffix(".xml"): path for path in graphs.values()}
+    suited = [source.graph(forms or None, RUNTIME) for forms in graphs]
+    lowered = {path.with_suffix(".xml"): path for path in suited}
     for compiled, path in lowered.items():
         to_ir(path, compiled)
     own = _fastest([Runner(compiled, precision, RUNTIME) for compiled in lowered], threads)

@@ -60,13 +60,13 @@ class Source:
         stages = self.network.arch.stages  # an export may run fewer of them
         return tuple((form,) * stages for form in get_args(Form))
 
-    def graph(self, forms: Sequence[Form] | None = None) -> Path:
-        """The file of its graph, in these forms where it has any."""
+    def graph(self, forms: Sequence[Form] | None = None, runtime: str = "onnxruntime") -> Path:
+        """The file of its graph for a runtime, in these forms where it has any."""
         if self.given:
             return self.path
         from ..model.export import OPSET, export
 
-        path = self._folder / f"float-{'-'.join(forms or ['given'])}.onnx"
+        path = self._folder / f"float-{'-'.join(forms or ['given'])}-{runtime}.onnx"
         if not path.exists():
             asked = self._asked
             export(
@@ -77,6 +77,7 @@ class Source:
                 asked.opset or OPSET,
                 asked.stages,
                 forms or None,
+                runtime,
             )
         return path
 

@@ -136,7 +136,8 @@ class _Graphs:
     def float(self, size: Resolution) -> Path:
         path = self.folder / "float-{}x{}.onnx".format(*size)
         if not path.exists():
-            export(self.network, path, size, self.trials.judge.origin, forms=self.forms)
+            origin, runtime = self.trials.judge.origin, self.point.runtime
+            export(self.network, path, size, origin, forms=self.forms, runtime=runtime)
         return path
 
     def lowered(self, size: Resolution) -> Path:

@@ -27,6 +27,35 @@ def class_ids(scores: Tensor, factor: int) -> Tensor:
         lines = torch.stack(down[start : start + size], 1)  # (B, size, h + 1, w + 2, classes)
         points = [line.argmax(-1) for line in _between(lines, 3, factor)]
         ids.append(torch.stack(points, 2).flatten(1, 2))  # (B, size·factor, h + 1, w + 1)
+    return _interleaved(ids, factor)
+
+
+def class_ids_by_maxima(scores: Tensor, factor: int) -> Tensor:
+    """`class_ids` without an argmax, the scores of a class side by side.
+
+    Of classes 0 … n − 1 the first that has the greatest score is n − max (n − k) over all k whose
+    score is the greatest: two maxima, which run along memory where an argmax sorts.
+    """
+    classes = scores.shape[1]
+    left = torch.arange(classes, 0, -1, dtype=scores.dtype, device=scores.device).view(-1, 1, 1)
+    planes = _framed(_framed(scores, 2), 3)
+    height = planes.shape[2] - 1
+    down = _between(planes, 2, factor)
+    size = factor * factor // GROUPS
+    ids = []
+    for start in range(0, factor, size):
+        lines = torch.cat(down[start : start + size], 2)  # (B, classes, size·(h + 1), w + 2)
+        points = []
+        for line in _between(lines, 3, factor):
+            greatest = line >= line.amax(1, keepdim=True)
+            after = torch.where(greatest, left, left.new_zeros(())).amax(1)
+            points.append((classes - after).view(len(scores), size, height, -1))
+        ids.append(torch.stack(points, 2).flatten(1, 2))  # (B, size·factor, h + 1, w + 1)
+    return _interleaved(ids, factor)
+
+
+def _interleaved(ids: list[Tensor], factor: int) -> Tensor:
+    """The ids of pixels that have the same place between their neighbours → all, cut to size."""
     # Floats, as few runtimes interleave integers; they hold every class id.
     full = F.pixel_shuffle(torch.cat(ids, 1).float(), factor).squeeze(1)
     edge = factor // 2

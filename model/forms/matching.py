@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..arch import RADIUS
+from ..layers import enlarge
 from ..volume import Matching
 
 NARROW = 32
@@ -76,7 +77,24 @@ def soft_argmin(cost: Tensor, first: int) -> Tensor:
     return (above / below).view(cost.shape[0], 1, *cost.shape[2:])
 
 
-ROWS = Matching(first_volume, residual_volume, soft_argmin)
+def enlarge_by_products(maps: Tensor, factor: int) -> Tensor:
+    """`rts2.model.layers.enlarge` as two matrix products: (B, C, h, w) → (B, C, f·h, f·w).
+
+    A bilinear map is linear along each axis by itself: R_y · maps · R_xᵀ, where row i of an R has
+    the shares of the two old places around the new place i. Both are constants.
+    """
+    height, width = maps.shape[-2:]
+    return _shares(height, factor, maps) @ (maps @ _shares(width, factor, maps).T)
+
+
+def _shares(size: int, factor: int, like: Tensor) -> Tensor:
+    """(factor·size, size): a unit vector at each old place, enlarged along y alone."""
+    units = torch.eye(size, dtype=like.dtype, device=like.device).view(1, 1, size, size)
+    target = (factor * size, size)
+    return F.interpolate(units, size=target, mode="bilinear", align_corners=False)[0, 0]
+
+
+ROWS = Matching(first_volume, residual_volume, soft_argmin, enlarge)
 
 
 def _rows(maps: Tensor) -> Tensor:

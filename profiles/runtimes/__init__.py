@@ -120,7 +120,8 @@ def open_session(
     folder = mkdtemp(prefix="rts2.")
     try:
         path = Path(folder) / "network.onnx"
-        export(model.network, path, model.resolution, model.origin, stages=model.stages)
+        network, size = model.network, model.resolution
+        export(network, path, size, model.origin, stages=model.stages, runtime=runtime)
         session = known.open(path, precision, threads)
     except BaseException:
         rmtree(folder, ignore_errors=True)

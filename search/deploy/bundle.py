@@ -175,7 +175,15 @@ def _export(
 
     resolution, forms = deployment.input.resolution, deployment.forms
     opset = support.opset or OPSET
-    export(source.network, path, resolution, source.origin, opset=opset, forms=forms)
+    export(
+        source.network,
+        path,
+        resolution,
+        source.origin,
+        opset=opset,
+        forms=forms,
+        runtime=support.runtime,
+    )
     refuse_operators(path, support)
     multiple = deployment.arch.multiple
     left, right = (torch.from_numpy(prepared(image, multiple)) for image in (pair.left, pair.right))

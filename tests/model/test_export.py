@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from copy import deepcopy
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.export import OPSETS, Deployed, export, parity
 from rts2.model.graph import load_graph, read_header
 from rts2.model.predictor import prepared
+from rts2.profiles.runtimes.ov import Session
 
 Lively = Callable[[Network], Network]
 
@@ -57,6 +59,48 @@ def test_graph_and_network_agree(lively: Lively, arch: Arch, stages: int, tmp_pa
     assert found.disparity_px <= 1e-3
     assert found.semantic_share == (0 if arch.semantic else None)
     check_constants_are_folded(load_graph(path))
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3])
+@pytest.mark.parametrize("arch", ARCHS, ids=Arch.label)
+def test_a_graph_for_openvino_says_the_same_in_every_runtime(
+    lively: Lively, arch: Arch, stages: int, tmp_path: Path
+) -> None:
+    network = lively(build(arch))
+    path = tmp_path / "a.onnx"
+    export(network, path, RESOLUTION, UNTRAINED, opset=13, stages=stages, runtime="openvino")
+    check_suits_openvino(load_graph(path))
+    left, right = textured(96, 64)
+    assert np.ptp(run(path, left, right)["disparity"]) > 1
+    found = parity(path, network, left, right)
+    assert found.disparity_px <= 1e-3
+    assert found.semantic_share == (0 if arch.semantic else None)
+    in_openvino(path, network, left, right)
+
+
+def check_suits_openvino(model: onnx.ModelProto) -> None:
+    """It takes no argmax, and the answer is enlarged by a product."""
+    assert "ArgMax" not in {node.op_type for node in model.graph.node}
+    shapes = {
+        value.name: [side.dim_value for side in value.type.tensor_type.shape.dim]
+        for value in [*model.graph.value_info, *model.graph.output]
+    }
+    enlarging = [node for node in model.graph.node if node.op_type == "Resize"]
+    assert (64, 96) not in {tuple(shapes[node.output[0]][2:]) for node in enlarging}
+
+
+def in_openvino(path: Path, network: Network, left: Tensor, right: Tensor) -> None:
+    """Where OpenVINO is installed it is asked, too."""
+    if find_spec("openvino") is None:
+        return
+    session = Session(path, "fp32", 1)
+    names = ["disparity", "semantic"] if network.arch.semantic else ["disparity"]
+    found = session.answer(names, {"left": left.numpy(), "right": right.numpy()})
+    with torch.inference_mode():
+        wanted = Deployed(network, read_header(path).stages)(left, right)
+    assert np.abs(found[0] - wanted[0].numpy()).max() <= 1e-3
+    for ids, expected in zip(found[1:], wanted[1:], strict=True):
+        assert np.array_equal(ids, expected.numpy())
 
 
 def run(path: Path, left: Tensor, right: Tensor) -> dict[str, np.ndarray]:
@@ -265,13 +309,15 @@ def real_pair(real_data: Path, frame: int, multiple: int) -> tuple[Tensor, Tenso
     return left, right
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @pytest.mark.parametrize("stages", [1, 2, 3])
 def test_parity_of_the_trained_anynet_on_a_real_pair(
-    real_data: Path, tmp_path: Path, stages: int
+    real_data: Path, tmp_path: Path, stages: int, runtime: str
 ) -> None:
     network, header = load(real_data / "anynet_official" / "kitti2015.tar")
     path = tmp_path / "a.onnx"
-    export(network, path, (1232, 368), header.origin, opset=13, stages=stages)
+    size = (1232, 368)
+    export(network, path, size, header.origin, opset=13, stages=stages, runtime=runtime)
     found = parity(path, network, *real_pair(real_data, 0, 16))
     assert found.disparity_px <= 1e-3
 
@@ -294,13 +340,14 @@ def test_parity_where_float_noise_is_larger_than_the_bound(real_data: Path, tmp_
     assert own < 0.02  # else the comparison would forgive anything
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @pytest.mark.parametrize("branches", BRANCHES)
 def test_parity_of_every_variant_on_a_real_pair(
-    lively: Lively, real_data: Path, tmp_path: Path, branches: dict[str, bool]
+    lively: Lively, real_data: Path, tmp_path: Path, branches: dict[str, bool], runtime: str
 ) -> None:
     network = lively(build(Arch(c=2, **branches)))
     path = tmp_path / "a.onnx"
-    export(network, path, (1216, 352), UNTRAINED, opset=13)
+    export(network, path, (1216, 352), UNTRAINED, opset=13, runtime=runtime)
     found = parity(path, network, *real_pair(real_data, 1, 32))
     assert found.disparity_px <= 1e-3
     assert found.semantic_share is None or found.semantic_share <= 1e-4

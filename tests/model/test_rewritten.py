@@ -10,12 +10,19 @@ from torch import Tensor, nn
 
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import Network, build
-from rts2.model.forms import ROWS, class_ids, rewritten
+from rts2.model.forms import (
+    ROWS,
+    class_ids,
+    class_ids_by_maxima,
+    enlarge_by_products,
+    rewritten,
+)
 from rts2.model.forms.stem import Phases, phases
 from rts2.model.layers import enlarge
 from rts2.model.volume import PLAIN
 
 Lively = Callable[[Network], Network]
+Classified = Callable[[Tensor, int], Tensor]
 
 
 def relative(wanted: Tensor, found: Tensor) -> float:
@@ -65,13 +72,32 @@ def test_half_costs_are_taken_in_floats() -> None:
     assert found.dtype == torch.float32
 
 
+@pytest.mark.parametrize("classified", [class_ids, class_ids_by_maxima])
 @pytest.mark.parametrize("factor", [4, 8, 16])
 @pytest.mark.parametrize("size", [(1, 1), (3, 5)])
-def test_classes_are_those_of_enlarged_scores(size: tuple[int, int], factor: int) -> None:
+def test_classes_are_those_of_enlarged_scores(
+    size: tuple[int, int], factor: int, classified: Classified
+) -> None:
     scores = torch.randn(2, 19, *size, dtype=torch.float64)
-    found = class_ids(scores, factor)
+    found = classified(scores, factor)
     assert found.dtype == torch.int32
     assert torch.equal(found, enlarge(scores, factor).argmax(1).int())
+
+
+@pytest.mark.parametrize("classified", [class_ids, class_ids_by_maxima])
+def test_of_equal_scores_the_first_wins(classified: Classified) -> None:
+    scores = torch.zeros(1, 5, 2, 3)
+    scores[:, [2, 4]] = 1.5
+    assert torch.equal(classified(scores, 4), torch.full((1, 8, 12), 2, dtype=torch.int32))
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8, 16])
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (96, 312)])
+def test_products_enlarge_as_bilinear_maps(size: tuple[int, int], factor: int) -> None:
+    maps = torch.rand(2, 1, *size, dtype=torch.float64) * 192
+    wanted, found = enlarge(maps, factor), enlarge_by_products(maps, factor)
+    assert wanted.shape == found.shape
+    assert relative(wanted, found) <= 1e-12
 
 
 @pytest.mark.parametrize(
@@ -93,11 +119,14 @@ def test_encoders_are_equal_up_to_the_borders(lively: Lively, c: int) -> None:
         assert relative(a, b) <= 1e-12
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @pytest.mark.parametrize("family", ["rts2net", "anynet"])
-def test_a_rewritten_network_is_a_copy_that_says_the_same(lively: Lively, family: str) -> None:
+def test_a_rewritten_network_is_a_copy_that_says_the_same(
+    lively: Lively, family: str, runtime: str
+) -> None:
     network = lively(build(Arch(family=family, c=2, d_max=5))).double().train()
     before, random = deepcopy(network.state_dict()), torch.get_rng_state()
-    found = rewritten(network)
+    found = rewritten(network, runtime)
     assert torch.equal(random, torch.get_rng_state())
     assert all(module.training for module in network.modules())
     assert not any(module.training for module in found.modules())

@@ -32,14 +32,17 @@ ARCHS = [
 ]
 
 
-def exported(make: Make, arch: Arch, folder: Path) -> onnx.ModelProto:
-    export(make(arch), folder / "a.onnx", (96, 64), "x", opset=13)
+def exported(make: Make, arch: Arch, folder: Path, runtime: str = "onnxruntime") -> onnx.ModelProto:
+    export(make(arch), folder / "a.onnx", (96, 64), "x", opset=13, runtime=runtime)
     return load_graph(folder / "a.onnx")
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 @pytest.mark.parametrize("arch", ARCHS, ids=Arch.label)
-def test_all_that_carries_a_disparity_is_kept(network: Make, arch: Arch, tmp_path: Path) -> None:
-    model = exported(network, arch, tmp_path)
+def test_all_that_carries_a_disparity_is_kept(
+    network: Make, arch: Arch, runtime: str, tmp_path: Path
+) -> None:
+    model = exported(network, arch, tmp_path, runtime)
     kept = dict(kept_float(model))
     counts = Counter(kept.values())
     # A soft-argmin a stage: least cost, difference, exponential, shape, sums, one and the other;

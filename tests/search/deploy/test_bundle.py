@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from rts2.model.arch import Arch
-from rts2.model.bundle import CONFIGURATION, graph_of
+from rts2.model.bundle import CONFIGURATION, MODEL, graph_of
 from rts2.model.checkpoint import build
 from rts2.model.data.catalog import open_dataset
 from rts2.model.errors import Rts2Error, UsageError
 from rts2.model.export import Deployed
-from rts2.model.graph import read_header
+from rts2.model.graph import load_graph, read_header
 from rts2.model.predictor import prepared
 from rts2.profiles import opset
 from rts2.profiles.opset import load_opset, operators, refuse_operators
@@ -297,6 +297,13 @@ def test_the_options_of_a_runtime_are_told(bundle: Maker) -> None:
         assert ov.file == file
         assert ov.properties["INFERENCE_PRECISION_HINT"] == hint
         assert ov.properties["INFERENCE_NUM_THREADS"] == machine.threads
+
+
+def test_a_graph_is_in_the_steps_that_suit_its_runtime(bundle: Callable[..., Path]) -> None:
+    """OpenVINO sorts for an argmax."""
+    for runtime, wanted in (("onnxruntime", True), ("openvino", False)):
+        model = load_graph(bundle("cpu", runtime, "fp32") / MODEL)
+        assert any(node.op_type == "ArgMax" for node in model.graph.node) is wanted
 
 
 REPEATED = """
