@@ -174,11 +174,10 @@ class Bench:
             yield Row(each, measure(each.run, beside, patience=PATIENCE), apart_px, apart)
 
     def _others(self) -> Iterator[Contender]:
-        lowered = self._integers()
-        yield self._ort("ONNX Runtime int8", lowered, "int8")
+        yield self._ort("ONNX Runtime int8", self._integers("onnxruntime"), "int8")
         if "openvino" not in available():
             return
-        graph = self._graph("openvino")
+        graph, lowered = self._graph("openvino"), self._integers("openvino")
         yield self._openvino(graph, graph, "fp32")
         yield self._openvino(lowered, lowered, "int8")
         compiled = graph.with_suffix(".xml")
@@ -192,12 +191,12 @@ class Bench:
         ratios = race([Runner(path, "fp32", runtime) for path in paths], cores())
         return paths[int(np.argmin(ratios))]
 
-    def _integers(self) -> Path:
+    def _integers(self, runtime: str) -> Path:
         """The usual layers in 8 bits."""
-        model, header = opened(self._source.graph(FORMS[-1]))
-        known = calibrate(model, header, self._pairs, self._folder / "calibration.npz")
+        model, header = opened(self._source.graph(FORMS[-1], runtime))
+        known = calibrate(model, header, self._pairs, self._folder / f"{runtime}.npz")
         made = integers(model, usual(model), known.ranges("percentile"))
-        path = self._folder / "int8.onnx"
+        path = self._folder / f"int8-{runtime}.onnx"
         save_graph(made, header.model_copy(update={"precision": "int8"}), path)
         return path
 
