@@ -73,8 +73,9 @@ def soft_argmin(cost: Tensor, first: int) -> Tensor:
         cost = cost.float()
     weights = (cost.amin(1, keepdim=True) - cost).exp().flatten(2)
     planes = torch.arange(first, first + cost.shape[1], dtype=cost.dtype, device=cost.device)
-    above, below = (torch.stack([planes, torch.ones_like(planes)]) @ weights).chunk(2, 1)
-    return (above / below).view(cost.shape[0], 1, *cost.shape[2:])
+    sums = torch.stack([planes, torch.ones_like(planes)]) @ weights
+    above, below = torch.split(sums.view(cost.shape[0], 2, *cost.shape[2:]), 1, 1)
+    return above / below
 
 
 def enlarge_by_products(maps: Tensor, factor: int) -> Tensor:
