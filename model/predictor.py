@@ -6,6 +6,7 @@ No runtime is imported before a model of its kind is opened.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -102,15 +103,23 @@ def prepared(image: Bytes, multiple: int) -> Input:
 
     H' and W' are the next multiples. The zeros come after the normalisation: they are mean grey.
     """
+    import cv2
+
     height, width = image.shape[:2]
     tensor = np.zeros((1, 3, *padded((width, height), multiple)), np.float32)
-    scale = np.float32(255) * np.array(STD, np.float32)
-    shift = np.array(MEAN, np.float32) / np.array(STD, np.float32)
-    for channel in range(3):  # plane by plane, in place: a seventh of the time
-        plane = tensor[0, channel, :height, :width]
-        np.divide(image[..., channel], scale[channel], out=plane)
-        plane -= shift[channel]
+    # Looked up plane by plane, in place: a third of the time that arithmetic takes.
+    planes = cv2.split(np.ascontiguousarray(image))
+    for plane, table, target in zip(planes, _normalised(), tensor[0], strict=True):
+        cv2.LUT(plane, table, target[:height, :width])
     return tensor
+
+
+@cache
+def _normalised() -> NDArray[np.float32]:
+    """What a network is given for each byte of each channel: (3, 256)."""
+    mean, std = (np.array(values, np.float32)[:, None] for values in (MEAN, STD))
+    levels = np.arange(256, dtype=np.float32)
+    return levels / (255 * std) - mean / std
 
 
 class TorchPredictor:
