@@ -16,9 +16,9 @@ from ...model.machine import features
 from .attribution import Kernel, Node, Step, distinctly_named, kernels, node_times_ms, nodes_of
 from .session import noise
 
-HINTS: Final[dict[Precision, str]] = {"fp32": "f32", "bf16": "bf16", "fp16": "f16", "int8": "f32"}
+HINTS: Final[dict[Precision, str]] = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 """The precision of float operators, said in every case: left alone, OpenVINO takes bf16 where the
-processor has it. Half precision between integers costs accuracy, so those of int8 stay f32."""
+processor has it."""
 
 NATIVE: Final[dict[Precision, tuple[str, frozenset[str]]]] = {
     "bf16": ("BF16", frozenset(("avx512_bf16", "amx_bf16", "avx_ne_convert", "bf16"))),
@@ -92,7 +92,7 @@ class Session:
             model = load_graph(self._path)
             source = model.SerializeToString() if distinctly_named(model) else source
         settings = {
-            "INFERENCE_PRECISION_HINT": HINTS[self._precision],
+            "INFERENCE_PRECISION_HINT": hint(self._precision),
             "INFERENCE_NUM_THREADS": self._threads,
             "NUM_STREAMS": 1,
             "PERFORMANCE_HINT": "LATENCY",
@@ -118,7 +118,7 @@ class Session:
     def _require_precision(self, compiled: Any) -> None:
         """OpenVINO takes another precision without a word where the processor lacks the one."""
         taken = compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name()
-        wanted = HINTS[self._precision]
+        wanted = hint(self._precision)
         if taken != wanted:
             raise Rts2Error(
                 f"OpenVINO computes in {taken} on this processor, not in {wanted}; "
@@ -126,20 +126,32 @@ class Session:
             )
 
 
+def hint(precision: Precision) -> str:
+    """What OpenVINO is told for a precision on this processor.
+
+    Between integers it computes in bf16, where the processor does.
+    """
+    if precision == "int8":
+        return HINTS["bf16" if "bf16" in _half() else "fp32"]
+    return HINTS[precision]
+
+
 def precisions(stored: Precision) -> tuple[Precision, ...]:
     """What this processor computes natively; a graph of integers stays one."""
-    if stored == "int8":
-        return ("int8",)
+    return ("int8",) if stored == "int8" else ("fp32", *_half())
+
+
+def _half() -> tuple[Precision, ...]:
+    """The half precisions that this processor computes natively."""
     import openvino
 
     able = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     known = features()
-    half = (
+    return tuple(
         precision
         for precision, (capability, native) in NATIVE.items()
         if capability in able and (not known or known & native)
     )
-    return ("fp32", *half)
 
 
 def versions() -> dict[str, str]:

@@ -71,6 +71,8 @@ def test_only_what_the_processor_has_is_offered(
     monkeypatch.setattr(ov, "features", lambda: frozenset(known))
     assert ov.precisions("fp32") == offered
     assert ov.precisions("int8") == ("int8",)
+    assert ov.hint("int8") == ("bf16" if "bf16" in offered else "f32")
+    assert ov.hint("fp32") == "f32"
 
 
 def test_the_version_is_the_packages() -> None:
