@@ -7,9 +7,8 @@ so a model is a handful of non-negative coefficients that a person can read in a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import prod
 from typing import Annotated, Literal, get_args
 
 import numpy as np
@@ -18,90 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from ..model.arch import Arch, Form
 from ..model.errors import Rts2Error
-from ..model.ops import BYTES_PER_ELEMENT, Kind, Op, ops
+from ..model.ops import Kind, Op, ops
+from .features import FEATURES
 from .parts import PartModel, parts
 
 Floats = NDArray[np.float64]
 Milliseconds = Annotated[float, Field(ge=0, le=1e6)]
-
-CHANNEL_BLOCK = 16
-"""Single-precision channels in one AVX-512 register: CPU kernels compute whole blocks."""
-
-IMAGE_CHANNELS = 3
-
-
-def _macs(op: Op, kind: Kind) -> float:
-    return op.macs / 1e9 if op.kind == kind else 0.0
-
-
-def _single(op: Op) -> float:
-    return _macs(op, "conv2d") if op.inputs[0][0] == 1 else 0.0
-
-
-def _blocked(op: Op, kind: Kind) -> float:
-    """Multiply-adds of a convolution on whole blocks of channels; an image's three stay three."""
-    inputs, outputs = op.inputs[0][1], op.output[1]
-    filled = _whole_blocks(outputs) / outputs
-    if kind == "conv2d" and inputs > IMAGE_CHANNELS:
-        filled *= _whole_blocks(inputs) / inputs
-    return _macs(op, kind) * filled
-
-
-def _whole_blocks(channels: int) -> int:
-    return -(-channels // CHANNEL_BLOCK) * CHANNEL_BLOCK
-
-
-def _packed(op: Op) -> float:
-    """Multiply-adds of a 2D convolution that packs channels in blocks: outputs always, inputs once
-    there is a whole block of them.
-    """
-    inputs, outputs = op.inputs[0][1], op.output[1]
-    filled = _whole_blocks(outputs) / outputs
-    if inputs >= CHANNEL_BLOCK:
-        filled *= _whole_blocks(inputs) / inputs
-    return _macs(op, "conv2d") * filled
-
-
-def _repacked(op: Op) -> float:
-    """10⁹ bytes of a 2D convolution's maps that fill no whole blocks, and are copied for it."""
-    if op.kind != "conv2d":
-        return 0.0
-    maps = [op.output, *(shape for shape in op.inputs if shape[1] > CHANNEL_BLOCK)]
-    return sum(BYTES_PER_ELEMENT * prod(m) / 1e9 for m in maps if m[1] % CHANNEL_BLOCK)
-
-
-def _columns(op: Op) -> float:
-    """10⁹ bytes of what a 3D convolution of 3×3×3 reads once its windows are laid out in a row."""
-    if op.kind != "conv3d":
-        return 0.0
-    return 27 * BYTES_PER_ELEMENT * op.inputs[0][1] * prod(op.output[2:]) / 1e9
-
-
-def _warped(op: Op) -> float:
-    return prod(op.output) / 1e6 if op.kind == "warp_volume" else 0.0
-
-
-FEATURES: dict[str, Callable[[Op], float]] = {
-    "gmac": lambda op: op.macs / 1e9,
-    "gmac_2d": lambda op: _macs(op, "conv2d"),
-    "gmac_2d_single": _single,
-    "gmac_2d_blocked": lambda op: _blocked(op, "conv2d"),
-    "gmac_2d_packed": _packed,
-    "gmac_3d": lambda op: _macs(op, "conv3d"),
-    "gmac_3d_blocked": lambda op: _blocked(op, "conv3d"),
-    "gbyte": lambda op: op.bytes / 1e9,
-    "gbyte_resize": lambda op: op.bytes / 1e9 if op.kind == "resize" else 0.0,
-    "gbyte_argmax": lambda op: op.bytes / 1e9 if op.kind == "argmax" else 0.0,
-    "gbyte_repacked": _repacked,
-    "gbyte_columns": _columns,
-    "mvoxel_warp": _warped,
-    "extra_kernel": lambda op: float(op.launches - 1),
-}
-"""What work is measured in: 10⁹ multiply-adds, of 2D convs, of those on one image alone (the
-semantic and refinement branches), with channels filled up to blocks (2D: inputs and outputs, 3D:
-outputs; `packed`: inputs only from a whole block on), of 3D convs; 10⁹ bytes moved, of those by
-resizing, by finding the best class, by copying maps into whole blocks, and by laying out the
-windows of 3D convs; 10⁶ voxels of residual volumes; kernels of a step beyond its first."""
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 

@@ -20,7 +20,8 @@ from ..model.arch import Arch, Form, Precision
 from ..model.errors import UsageError
 from ..model.files import parse_json, read_json
 from ..model.ops import Kind
-from .latency import FEATURES, LatencyModel
+from .features import FEATURES
+from .latency import LatencyModel
 from .parts import PartModel
 from .trtexec import Generation
 

@@ -9,33 +9,14 @@ no old kernel had is zero; beyond the borders both have zeros, as the old ones h
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ..phases import Phases, phases
 from ..rts2net import Encoder
-
-BLOCK = 16
-
-
-class Phases(NamedTuple):
-    """How many neighbours in y and x become one pixel: 1 or 2."""
-
-    y: int
-    x: int
-
-    @property
-    def pixels(self) -> int:
-        return self.y * self.x
-
-
-def phases(c: int) -> Phases:
-    """What is fastest for a stem of c channels (measured in ONNX Runtime)."""
-    if c % BLOCK == 0 or (c > BLOCK and c % 8):
-        return Phases(1, 1)
-    return Phases(1, 2) if c >= 8 else Phases(2, 2)
 
 
 class Overlapping(nn.Conv2d):
@@ -116,8 +97,7 @@ def _second(conv: nn.Conv2d, group: Phases) -> nn.Conv2d:
     """
     weight = conv.weight.detach()
     outputs, inputs = weight.shape[:2]
-    sides = [3 if count == 1 else 2 for count in group]
-    spread = weight.new_zeros(outputs, group.y, group.x, inputs, *sides)
+    spread = weight.new_zeros(outputs, group.y, group.x, inputs, *group.sides)
     for v in range(3):
         for u in range(3):
             (y, top), (x, left) = _place(v, group.y), _place(u, group.x)

@@ -17,8 +17,8 @@ from rts2.model.forms import (
     enlarge_by_products,
     rewritten,
 )
-from rts2.model.forms.stem import Phases, phases
 from rts2.model.layers import enlarge
+from rts2.model.phases import Phases, phases
 from rts2.model.volume import PLAIN
 
 Lively = Callable[[Network], Network]

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from rts2.model.arch import Arch
 from rts2.model.errors import Rts2Error
 from rts2.model.ops import Kind, Op, ops
+from rts2.profiles.features import FEATURES
 from rts2.profiles.latency import (
-    FEATURES,
     LatencyModel,
     Steps,
     latencies_ms,
@@ -48,6 +48,7 @@ WORK = {
     "gmac_2d_packed": (2.0 * 32 / 20, 0.5, 0, 0, 0),
     "gmac_3d": (0, 0, 0.25, 0, 0),
     "gmac_3d_blocked": (0, 0, 0.25 * 16 / 2, 0, 0),
+    "gmac_product": (0, 0, 0.25, 0, 0),
     "gbyte": (
         4e-9 * (600 + 4000 + 540),
         4e-9 * (200 + 800),
@@ -57,9 +58,10 @@ WORK = {
     ),
     "gbyte_resize": (0, 0, 0, 0, 0),
     "gbyte_argmax": (0, 0, 0, 0, 0),
-    # 20 outputs leave a block half empty; 27 numbers for each of 100 voxels.
+    # 20 outputs leave a block half empty; a number for each multiply-add of one of 2 outputs.
     "gbyte_repacked": (4e-9 * 4000, 0, 0, 0, 0),
-    "gbyte_columns": (0, 0, 4e-9 * 27 * 100, 0, 0),
+    "gbyte_columns": (0, 0, 4 * 0.25 / 2, 0, 0),
+    "gbyte_strided": (0, 0, 0, 0, 0),
     "mvoxel_warp": (0, 0, 0, 0, 0.3),
     "extra_kernel": (2, 0, 0, 0, 28),
 }
@@ -91,6 +93,27 @@ def test_features_by_hand(feature: str) -> None:
 def test_channels_are_filled_up_to_whole_blocks(channels: int, computed: int) -> None:
     op = Op("conv", "conv2d", ((1, 1, 1, 1),), (1, channels, 1, 1), macs=channels * 10**9)
     assert FEATURES["gmac_2d_blocked"](op) == pytest.approx(computed)
+
+
+def test_inputs_that_cannot_be_packed_are_laid_out_in_columns() -> None:
+    """ONNX Runtime copies four channels at a time; below a block it reads planes."""
+    for inputs, multiplied in ((15, False), (16, False), (18, True), (20, False), (29, True)):
+        for width in (10, 5):
+            op = Op("conv", "conv2d", ((1, inputs, 10, 10),), (1, 32, 10, width), macs=10**9)
+            assert (FEATURES["gmac_2d_packed"](op) == 0) is multiplied
+            assert FEATURES["gmac_product"](op) == (1 if multiplied else 0)
+            windows = 4 / 32 if multiplied else 0
+            assert FEATURES["gbyte_columns"](op) == windows
+            assert FEATURES["gbyte_strided"](op) == (windows if width < 10 else 0)
+
+
+def test_a_stem_counts_as_graphs_hold_it() -> None:
+    """c = 13 has two pixels, 26 channels, in one, which cannot be packed; c = 12 has 24."""
+    for c, multiplied in ((13, True), (12, False)):
+        second = next(op for op in ops(Arch(c=c), (640, 192)) if op.name == "encoder.stem.1.conv")
+        assert FEATURES["gmac_product"](second) == pytest.approx(
+            3 * 2 * 2 * c * c * 2 * 96 * 320 / 1e9 if multiplied else 0
+        )
 
 
 def test_bytes_of_resizing_are_those_of_resizing_alone() -> None:
