@@ -47,7 +47,7 @@ REFERENCE: tuple[Arch, Resolution] = (Arch(c=4, stages=2), (640, 192))
 PROFILED_RUNS = 5
 """Runs whose nodes are timed, on top of those that time the whole network."""
 
-MADE: dict[Runtime, tuple[Precision, ...]] = {"onnxruntime": ("int8",)}
+MADE: dict[Runtime, tuple[Precision, ...]] = {"onnxruntime": ("int8",), "openvino": ("int8",)}
 """What a runtime does not make of a float network by itself, and runs where the graph has it."""
 
 FIT_ERROR, FIT_PATIENCE = 0.02, 3.0

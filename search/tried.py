@@ -152,9 +152,9 @@ class _Graphs:
 
     def predictor(self, size: Resolution) -> Predictor:
         """What the point says of images of this size."""
-        if self.point.precision == "int8":
-            return OnnxPredictor(self.lowered(size))
-        path = self.float(size)
+        path = self.lowered(size) if self.point.precision == "int8" else self.float(size)
+        if self.point.runtime != "openvino":
+            return OnnxPredictor(path)
         compiled = path.with_suffix(".xml")
         to_ir(path, compiled)
         return OpenVinoPredictor(path, compiled, self.point.precision, self.trials.threads)

@@ -45,7 +45,7 @@ def profile(kind: Kind) -> Profile:
     support = RuntimeSupport(runtime="openvino", version="2026.3", source="rts2-profile")
     able = tuple(
         PrecisionSupport(precision=precision, supported=True, reason="timed", source="rts2-profile")
-        for precision in ("fp32", "bf16", "fp16")
+        for precision in ("fp32", "bf16", "fp16", "int8")
     )
     return known.model_copy(update={"runtimes": (*known.runtimes, support), "precisions": able})
 

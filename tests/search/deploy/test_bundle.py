@@ -28,6 +28,7 @@ from rts2.profiles.opset import load_opset, operators, refuse_operators
 from rts2.profiles.profile import Profile, load
 from rts2.search.deploy.bundle import TARGETS, Source, runtime_of, stale, write
 from rts2.search.deploy.configuration import read
+from rts2.search.deploy.ov import between_integers
 from rts2.search.deploy.schema import Deployment
 
 SIZE = (90, 60)
@@ -48,6 +49,7 @@ ALL: list[Kinds] = [
     ("cpu", "onnxruntime", "int8"),
     ("cpu", "openvino", "fp32"),
     ("cpu", "openvino", "bf16"),
+    ("cpu", "openvino", "int8"),
     ("rtx2080ti", "tensorrt", "int8"),
     ("rtx2080ti", "tensorrt", "fp16", "11"),
     ("rtx2080ti", "tensorrt", "int8", "11"),
@@ -290,13 +292,25 @@ def test_the_options_of_a_runtime_are_told(bundle: Maker) -> None:
         "graph_optimization": "all",
         "execution_mode": "sequential",
     }
-    for precision, hint, file in (("fp32", "f32", "model.onnx"), ("bf16", "bf16", "model.xml")):
+    for precision, hint, file in (
+        ("fp32", "f32", "model.onnx"),
+        ("bf16", "bf16", "model.xml"),
+        ("int8", "f32", "model.xml"),
+    ):
         ov = read(bundle("cpu", "openvino", precision) / CONFIGURATION).execution
         assert ov is not None
         assert ov.runtime == "openvino"
         assert ov.file == file
         assert ov.properties["INFERENCE_PRECISION_HINT"] == hint
         assert ov.properties["INFERENCE_NUM_THREADS"] == machine.threads
+
+
+def test_between_integers_openvino_is_told_what_the_device_was_timed_in() -> None:
+    known = load("cpu")
+    (first, *_) = known.calibrations
+    assert between_integers(known.model_copy(update={"calibrations": (first,)})) == "fp32"
+    half = first.model_copy(update={"runtime": "openvino", "precision": "bf16"})
+    assert between_integers(known.model_copy(update={"calibrations": (first, half)})) == "bf16"
 
 
 def test_a_graph_is_in_the_steps_that_suit_its_runtime(bundle: Callable[..., Path]) -> None:
@@ -326,7 +340,7 @@ def test_two_processes_write_equal_bytes_whatever_they_made_before(tmp_path: Pat
     except ImportError:
         pass
     else:
-        made.append("cpu-openvino-bf16")
+        made += ["cpu-openvino-bf16", "cpu-openvino-int8"]
     here = str(Path(__file__).parent)
     for folder, order in (("a", made), ("b/deeper", made[::-1])):
         words = [sys.executable, "-c", REPEATED, here, str(tmp_path / folder), ",".join(order)]
@@ -356,7 +370,6 @@ def test_a_bundle_is_made_for_the_runtime_that_was_asked_for_where_one_can_be(
     [
         (("cpu", "onnxruntime", "bf16"), "runs fp32 or int8 on onnxruntime, not bf16"),
         (("cpu", "onnxruntime", "fp16"), "not fp16; rts2-quantize makes such a graph"),
-        (("cpu", "openvino", "int8"), "runs fp32 or bf16 or fp16 on openvino, not int8"),
         (("tx2", "tensorrt", "int8"), "Jetson TX2 does not run int8: sm_62 has no DP4A"),
     ],
 )

@@ -247,7 +247,7 @@ def test_openvino_answers_in_every_precision_of_the_processor(
     pytest.importorskip("openvino", reason="needs OpenVINO: pip install 'rts2[openvino]' brings it")
     from rts2.profiles.runtimes import ov
 
-    for precision in ov.precisions("fp32"):
+    for precision in (*ov.precisions("fp32"), "int8"):
         folder = copied("cpu", "openvino", precision)
         told = json.loads(checked(folder, "--json").stdout)
         assert told["ok"]
