@@ -115,7 +115,7 @@ class Journal(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
-    schema_: Literal["rts2.timings/3"] = Field(default="rts2.timings/3", alias="schema")
+    schema_: Literal["rts2.timings/4"] = Field(default="rts2.timings/4", alias="schema")
     machine: Machine
     runtime: Runtime
     seed: int
@@ -139,7 +139,8 @@ class Bench:
         from .runtimes import open_session
 
         path = self._exported(*REFERENCE, "reference", runtime="onnxruntime")
-        return Reference(open_session("onnxruntime", path, "fp32", self.threads).run)
+        session = open_session("onnxruntime", path, "fp32", self.threads)
+        return Reference(session.run, settled=True)
 
     @property
     def own_ms(self) -> float:

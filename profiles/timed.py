@@ -136,7 +136,9 @@ class Clock:
 
         arch, resolution = references.REFERENCE
         sized = Sized(build(arch), resolution)
-        return timing.Reference(open_session(self.beside, sized, "fp32", self.threads).run)
+        return timing.Reference(
+            open_session(self.beside, sized, "fp32", self.threads).run, settled=True
+        )
 
 
 def given(path: Path, resolution: tuple[int, int] | None, stages: int | None) -> Given:

@@ -156,7 +156,7 @@ def test_a_journal_grows_by_one_sample_a_time_and_is_found_again(
         assert Job(last.arch, last.resolution, last.precision, last.forms) == job
         assert last.latency_ms == pytest.approx(bench.latency_ms(job))
         assert sum(last.parts_ms.values()) == pytest.approx(last.latency_ms)
-    assert json.loads(path.read_text())["schema"] == "rts2.timings/3"
+    assert json.loads(path.read_text())["schema"] == "rts2.timings/4"
 
 
 @pytest.fixture

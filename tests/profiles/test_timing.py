@@ -41,9 +41,9 @@ class Clock:
 
         return run
 
-    def reference(self, seconds: Callable[[int], float]) -> Reference:
+    def reference(self, seconds: Callable[[int], float], settled: bool = False) -> Reference:
         """A reference like `network`, named r."""
-        return Reference(self.network("r", seconds))
+        return Reference(self.network("r", seconds), settled)
 
 
 @pytest.fixture
@@ -96,6 +96,19 @@ def test_the_warm_up_is_not_counted(clock: Clock) -> None:
     )
     assert found.p95_ms == pytest.approx(100)
     assert found.reference_ms == pytest.approx(200)
+
+
+def test_of_a_settled_reference_the_second_run_counts(clock: Clock) -> None:
+    """The first finds the caches as the network left them: twice as slow, yet all is quiet."""
+
+    def cooled(_: int) -> float:
+        return 0.5 if clock.calls[-1] == "a" else 0.25
+
+    for settled, reference_ms in ((False, 500), (True, 250)):
+        clock.calls.clear()
+        found = measure(clock.network("a", lambda _: 0.5), clock.reference(cooled, settled))
+        assert found.quiet is settled
+        assert found.reference_ms == reference_ms
 
 
 def test_a_hiccup_moves_the_95th_percentile_and_neither_median_nor_spread(clock: Clock) -> None:
