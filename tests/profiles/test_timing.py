@@ -102,11 +102,11 @@ def test_of_a_settled_reference_the_second_run_counts(clock: Clock) -> None:
     """The first finds the caches as the network left them: twice as slow, yet all is quiet."""
 
     def cooled(_: int) -> float:
-        return 0.5 if clock.calls[-1] == "a" else 0.25
+        return 1 / 32 if clock.calls[-1] == "a" else 1 / 64
 
-    for settled, reference_ms in ((False, 500), (True, 250)):
+    for settled, reference_ms in ((False, 1000 / 32), (True, 1000 / 64)):
         clock.calls.clear()
-        found = measure(clock.network("a", lambda _: 0.5), clock.reference(cooled, settled))
+        found = measure(clock.network("a", lambda _: 1 / 32), clock.reference(cooled, settled))
         assert found.quiet is settled
         assert found.reference_ms == reference_ms
 
