@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from rts2.profiles.profile import Profile, load
+
 from .browser import Browser
 
 # Tests run side by side, one a core; torch reads this when it is first imported.
@@ -21,6 +23,20 @@ def real_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"RTS2_DATA names no folder: {path}"
     return path
+
+
+@pytest.fixture(scope="session")
+def ort_alone() -> Profile:
+    """The CPU's profile before anyone fitted OpenVINO beside ONNX Runtime."""
+    known = load("cpu")
+    kept: dict[str, object] = {
+        name: tuple(each for each in getattr(known, name) if each.runtime == "onnxruntime")
+        for name in ("calibrations", "points", "runtimes")
+    }
+    timed = {calibration.precision for calibration in known.calibrations}
+    own = {each.precision for each in known.calibrations if each.runtime == "onnxruntime"}
+    kept["precisions"] = tuple(p for p in known.precisions if p.precision not in timed - own)
+    return known.model_copy(update=kept)
 
 
 @pytest.fixture(scope="session")

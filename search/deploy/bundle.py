@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from ...model.arch import Precision
 from ...model.bundle import CONFIGURATION, MODEL, contents
 from ...model.errors import Rts2Error, UsageError
 from ...model.files import write_bytes, write_json
@@ -55,9 +56,11 @@ class Source:
     origin: str
 
 
-def runtime_of(profile: Profile, asked: Runtime | None = None) -> RuntimeSupport:
+def runtime_of(
+    profile: Profile, asked: Runtime | None = None, precision: Precision = "fp32"
+) -> RuntimeSupport:
     """The runtime that a bundle for the device is made for: what was asked for where a bundle can
-    be, else the first of the device's that one can be made for.
+    be, else the first of the device's that one can be made for, in the precision if any has it.
 
     Raises `UsageError` where rts2 delivers to none of the device's runtimes.
     """
@@ -67,7 +70,9 @@ def runtime_of(profile: Profile, asked: Runtime | None = None) -> RuntimeSupport
             f"{profile.title} has no runtime that a bundle can be made for; "
             f"those are {', '.join(TARGETS)}"
         )
-    return next((support for support in able if support.runtime == asked), able[0])
+    own = (support for support in able if support.runtime == asked)
+    fitting = (support for support in able if precision in TARGETS[support.runtime].tolerances)
+    return next(own, None) or next(fitting, able[0])
 
 
 def write(

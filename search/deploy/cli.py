@@ -143,14 +143,15 @@ def _deploy_parser() -> argparse.ArgumentParser:
 
 def _unpromised(arch: Arch, options: argparse.Namespace, profile: Profile) -> Deployment:
     """The configuration of a network without a front."""
-    runtime = runtime_of(profile, options.runtime).runtime
+    precision: Precision = options.precision or "fp32"
+    runtime = runtime_of(profile, options.runtime, precision).runtime
     if options.runtime not in (None, runtime):
         raise UsageError(
             f"{profile.title} runs {', '.join(known.runtime for known in profile.runtimes)}, not "
             f"{options.runtime}; rts2-profile fit --runtime {options.runtime} adds it to a profile"
         )
     size = options.resolution or KITTI
-    return of_arch(arch, profile, options.precision or "fp32", runtime, size)
+    return of_arch(arch, profile, precision, runtime, size)
 
 
 def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
@@ -173,6 +174,11 @@ def _asked(options: argparse.Namespace, profile: Profile) -> Deployment | None:
         raise UsageError(f"{options.front} was searched at {width}x{height}; search again")
     point = found.prospect if options.prospect else found.selected
     if point is None:
+        if found.prospect is not None:
+            raise NothingFeasible(
+                f"{options.front} has no pick; --prospect deploys what it would pick on "
+                "extrapolated numbers, to be timed on the device"
+            )
         role = "prospect" if options.prospect else "pick"
         raise NothingFeasible(f"{options.front} has no {role}; search with another target")
     return of_point(point, found, profile)

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...model.bundle import contents, require_unchanged
+from ...model.bundle import CONFIGURATION, contents, require_unchanged
 from ...model.errors import Rts2Error
 from .bundle import VERIFY
+from .configuration import read
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,12 @@ def verify(folder: Path, as_json: bool = False) -> Verified:
 
     Raises:
         UsageError: the folder is no bundle.
-        Rts2Error: a file is missing or was changed, or has weights in a file that is missing.
+        Rts2Error: the configuration is not what its schema tells, or a file is missing or was
+            changed, or has weights in a file that is missing.
     """
-    for file in contents(folder):
+    files = contents(folder)
+    read(folder / CONFIGURATION)
+    for file in files:
         path = require_unchanged(folder, file)
         if path.suffix == ".onnx":
             _require_weights(path)

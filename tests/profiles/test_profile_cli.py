@@ -117,6 +117,12 @@ def as_list(text: str) -> list[str]:
     return [line.split()[0] for line in text.splitlines() if line.strip()]
 
 
+@pytest.fixture
+def device_alone(ort_alone: Profile, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A device's file of which ONNX Runtime alone was timed."""
+    return written(ort_alone, tmp_path_factory.mktemp("device") / "cpu.json")
+
+
 def test_list_names_every_device_with_what_it_can(run: Any) -> None:
     found = run("list", "--json").json
     assert found["schema"] == "rts2.profiles/1"
@@ -124,7 +130,7 @@ def test_list_names_every_device_with_what_it_can(run: Any) -> None:
     by_name = {device["name"]: device for device in found["devices"]}
     assert by_name["tx2"]["evidence"] == ["published"]
     assert by_name["cpu"]["evidence"] == ["measured"]
-    assert by_name["cpu"]["runtimes"] == ["onnxruntime"]
+    assert by_name["cpu"]["runtimes"] == ["onnxruntime", "openvino"]
     assert "int8" not in by_name["tx2"]["precisions"]
     shown = run("list")
     assert (shown.code, shown.err) == (0, "")
@@ -308,9 +314,9 @@ def test_another_machine_is_told_on_stderr_alone(run: Any, exact: Profile, tmp_p
 
 
 @pytest.mark.usefixtures("made_up")
-def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, tmp_path: Path) -> None:
+def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, device_alone: Path, tmp_path: Path) -> None:
     path = tmp_path / "new" / "my-cpu.json"
-    asked = ("fit", "--device", "cpu", "--threads", 1, "--out", path)
+    asked = ("fit", "--device", device_alone, "--threads", 1, "--out", path)
     found = run(*asked, "--budget", 40, "--json").json
     assert (found["schema"], found["file"]) == ("rts2.profile-fit/1", str(path))
     assert found["n"] == 40
@@ -330,9 +336,9 @@ def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, tmp_pat
 
 
 @pytest.mark.usefixtures("made_up")
-def test_a_budget_that_is_too_small_keeps_its_timings_and_goes_on(run: Any, tmp_path: Path) -> None:
+def test_a_budget_that_is_too_small_keeps_its_timings_and_goes_on(run: Any, device_alone: Path, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    asked = ("fit", "--device", "cpu", "--threads", 1, "--out", path)
+    asked = ("fit", "--device", device_alone, "--threads", 1, "--out", path)
     said = "reliable timings are too few for tables of parts, which need 24"
     refused(run(*asked, "--budget", 12), 1, f"12 {said}", "longer --budget")
     assert not path.exists()
@@ -341,17 +347,17 @@ def test_a_budget_that_is_too_small_keeps_its_timings_and_goes_on(run: Any, tmp_
 
 @pytest.mark.usefixtures("made_up")
 def test_a_budget_leaves_time_for_the_tables(
-    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Any, device_alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 60 s: 10 in any case, and half a second a network, one second each to time: 34 or 33."""
     monkeypatch.setattr(cli, "RESERVE_S", 10.0)
     monkeypatch.setattr(cli, "FITTING_S", 0.5)
-    asked = ("fit", "--device", "cpu", "--threads", 1, "--out", tmp_path / "x.json")
+    asked = ("fit", "--device", device_alone, "--threads", 1, "--out", tmp_path / "x.json")
     assert run(*asked, "--budget", 60, "--json").json["n"] == 33
 
 
 def test_a_fit_on_a_busy_machine_is_told_to_be_one(
-    run: Any, made_up: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Any, device_alone: Path, made_up: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every second network of 60, and every fourth: more and less than a third."""
     plain = made_up.time
@@ -363,7 +369,7 @@ def test_a_fit_on_a_busy_machine_is_told_to_be_one(
             return found
 
         monkeypatch.setattr(made_up, "time", time)
-        asked = ("fit", "--device", "cpu", "--threads", 1, "--budget", 60)
+        asked = ("fit", "--device", device_alone, "--threads", 1, "--budget", 60)
         found = run(*asked, "--out", tmp_path / f"{each}.json")
         assert found.code == 0
         assert ("of 60 networks were timed while the machine was busy" in found.err) == told
@@ -551,12 +557,12 @@ sys.exit(profile(sys.argv[2:]))
 
 
 def test_a_killed_fit_goes_on_from_its_samples_and_repeats_none(
-    run: Any, made_up: Any, tmp_path: Path
+    run: Any, device_alone: Path, made_up: Any, tmp_path: Path
 ) -> None:
     path, journal = tmp_path / "x.json", tmp_path / "x.timings.json"
     truth = tmp_path / "truth.json"
     truth.write_text(made_up.truth.model_dump_json())
-    asked = ["fit", "--device", "cpu", "--threads", "1", "--budget", "24", "--out", str(path)]
+    asked = ["fit", "--device", str(device_alone), "--threads", "1", "--budget", "24", "--out", str(path)]
     started = subprocess.Popen([sys.executable, "-c", SLOW, str(truth), *asked])
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and started.poll() is None:

@@ -11,7 +11,7 @@ from rts2.model.ops import padded
 from rts2.profiles.here import this_machine
 from rts2.profiles.latency import predict_ms
 from rts2.profiles.parts import AXES, PartModel, PartTable, axis_values
-from rts2.profiles.profile import Calibration, Point, Profile, load
+from rts2.profiles.profile import Calibration, Point, Profile
 
 RESOLUTIONS = ((640, 192), (1242, 375))
 BEST = Arch(c=32)
@@ -57,7 +57,7 @@ def _ends() -> list[Arch]:
 
 
 @pytest.fixture(scope="session")
-def by_parts() -> Profile:
+def by_parts(ort_alone: Profile) -> Profile:
     """Timed 1% to 26% faster or slower than its tables say, the `BEST` 5% faster."""
     model = _model()
     timed = [*product(_ends(), RESOLUTIONS), *((BEST, size) for size in RESOLUTIONS)]
@@ -74,7 +74,7 @@ def by_parts() -> Profile:
         )
         for (arch, resolution), residual in zip(timed, residuals, strict=True)
     ]
-    known = load("cpu").model_copy(
+    known = ort_alone.model_copy(
         update={
             "name": "made-up",
             "calibrations": (

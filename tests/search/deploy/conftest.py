@@ -37,19 +37,6 @@ class Kind(NamedTuple):
     triton: bool = False
 
 
-def profile(kind: Kind) -> Profile:
-    """The device's profile; with OpenVINO in it, as a fit writes it, where it is asked for."""
-    known = load(kind.device)
-    if kind.runtime != "openvino":
-        return known
-    support = RuntimeSupport(runtime="openvino", version="2026.3", source="rts2-profile")
-    able = tuple(
-        PrecisionSupport(precision=precision, supported=True, reason="timed", source="rts2-profile")
-        for precision in ("fp32", "bf16", "fp16", "int8")
-    )
-    return known.model_copy(update={"runtimes": (*known.runtimes, support), "precisions": able})
-
-
 def asked(known: Profile, kind: Kind) -> Deployment:
     """What a front would ask for; the numbers are made up."""
     point = Point(
@@ -92,7 +79,7 @@ def written(folder: Path, kind: Kind) -> Path:
     folder.mkdir(parents=True)
     if kind.runtime == "openvino" and kind.precision != "fp32":
         pytest.importorskip("openvino", reason="needs OpenVINO: pip install 'rts2[openvino]'")
-    known = profile(kind)
+    known = load(kind.device)
     torch.manual_seed(0)
     source = Source(build(SMALL), "untrained")
     write(source, asked(known, kind), known, folder, kind.generation, kind.triton)
@@ -137,7 +124,7 @@ def order() -> Callable[..., tuple[Profile, Deployment]]:
 
     def of(*fields: Any) -> tuple[Profile, Deployment]:
         kind = Kind(*fields)
-        known = profile(kind)
+        known = load(kind.device)
         return known, asked(known, kind)
 
     return of

@@ -295,7 +295,7 @@ def test_the_options_of_a_runtime_are_told(bundle: Maker) -> None:
     for precision, hint, file in (
         ("fp32", "f32", "model.onnx"),
         ("bf16", "bf16", "model.xml"),
-        ("int8", "f32", "model.xml"),
+        ("int8", "bf16", "model.xml"),
     ):
         ov = read(bundle("cpu", "openvino", precision) / CONFIGURATION).execution
         assert ov is not None
@@ -355,14 +355,21 @@ def test_two_processes_write_equal_bytes_whatever_they_made_before(tmp_path: Pat
 
 
 def test_a_bundle_is_made_for_the_runtime_that_was_asked_for_where_one_can_be(
-    order: Callable[..., tuple[Profile, Deployment]],
+    ort_alone: Profile,
 ) -> None:
-    both = order("cpu", "openvino", "fp32")[0]
+    both = load("cpu")
     assert runtime_of(both).runtime == "onnxruntime"
     for runtime in ("onnxruntime", "openvino"):
         assert runtime_of(both, runtime).runtime == runtime
-    assert runtime_of(load("cpu"), "openvino").runtime == "onnxruntime"
+    assert runtime_of(ort_alone, "openvino").runtime == "onnxruntime"
     assert runtime_of(load("tx2"), "pytorch").runtime == "tensorrt"
+
+
+def test_without_a_runtime_the_first_that_has_the_precision_is_taken(ort_alone: Profile) -> None:
+    both = load("cpu")
+    assert runtime_of(both, precision="int8").runtime == "onnxruntime"
+    assert runtime_of(both, precision="bf16").runtime == "openvino"
+    assert runtime_of(ort_alone, precision="bf16").runtime == "onnxruntime"
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def test_a_configuration_never_changes() -> None:
 def test_the_graph_holds_its_3d_convs_as_the_device_runs_them_fastest() -> None:
     """A profile in which banded 3D convs take no time at all, and none in which they were timed."""
     known = load("cpu")
-    (calibration,) = [c for c in known.calibrations if c.precision == "fp32"]
+    calibration = known.calibration("onnxruntime", "fp32")
     assert isinstance(calibration.model, PartModel)
     tables = {
         name: table

@@ -14,8 +14,9 @@ from torch import nn
 from rts2.model.arch import Arch
 from rts2.model.checkpoint import build, cut, load, save
 from rts2.model.export import Deployed, parity
-from rts2.model.files import sha256
+from rts2.model.files import sha256, write_json
 from rts2.model.graph import read_header
+from rts2.profiles.profile import Profile
 from rts2.profiles.profile import load as load_profile
 from rts2.search.cli import deploy, search
 from rts2.search.deploy.configuration import of_point, read
@@ -254,9 +255,11 @@ def test_without_a_front_precision_runtime_and_generation_can_be_said(
 
 
 def test_what_a_device_does_not_have_without_a_front_is_refused(
-    run: Any, checkpoint: Callable[..., Path]
+    run: Any, checkpoint: Callable[..., Path], ort_alone: Profile, tmp_path: Path
 ) -> None:
-    asked = ("--device", "cpu", "--model", checkpoint(PROSPECT), "--resolution", "96x64")
+    device = tmp_path / "box.json"
+    write_json(device, ort_alone.model_dump(mode="json", by_alias=True, exclude_none=True))
+    asked = ("--device", device, "--model", checkpoint(PROSPECT), "--resolution", "96x64")
     refused(run(*asked, "--runtime", "openvino"), 2, "rts2-profile fit --runtime openvino adds it")
     refused(run(*asked, "--precision", "bf16"), 2, "runs fp32 or int8 on onnxruntime, not bf16")
     refused(run(*asked, "--tensorrt", "10"), 2, "--tensorrt is for TensorRT")
@@ -388,6 +391,12 @@ def test_random_weights_are_deployed_only_on_request(
     assert run(*asked, "--model", path, "--untrained", "--json").json["weights"] == "untrained"
 
 
+def test_a_front_without_a_pick_names_its_prospect(run: Any, front: Callable[..., Path]) -> None:
+    asked = ("--device", "cpu", "--front", front("cpu", selected=None), "--untrained")
+    refused(run(*asked), 3, "has no pick; --prospect deploys")
+    assert run(*asked, "--prospect").code == 0
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "rts2.profile/1"}'])
 def test_a_file_that_is_no_front_is_one_line(run: Any, tmp_path: Path, text: str) -> None:
     path = tmp_path / "front.json"
@@ -406,7 +415,7 @@ def test_a_front_that_does_not_fit_is_refused_and_nothing_is_written(
     cases: list[tuple[int, str, tuple[object, ...]]] = [
         (2, "searched for tx2, not for cpu", ("--device", "cpu", "--front", tx2)),
         (2, "searched at 96x64", ("--device", "tx2", "--front", tx2, "--resolution", "640x192")),
-        (3, "has no pick", ("--device", "cpu", "--front", without)),
+        (3, "has no pick; search with", ("--device", "cpu", "--front", without)),
         (3, "has no prospect", ("--device", "cpu", "--front", without, "--prospect")),
         (2, "no such file", ("--device", "cpu", "--front", tmp_path / "none.json")),
         (2, "no such file", ("--device", "cpu", "--model", tmp_path / "none.safetensors")),
@@ -563,6 +572,15 @@ def test_a_bundle_that_was_changed_is_not_run(verify: Any, made: Path) -> None:
     refused(verify(made), 1, "verify.py is not the file that deployment.json tells the hash of")
     script.unlink()
     refused(verify(made), 1, "holds no verify.py; make the bundle again")
+
+
+def test_verify_refuses_a_configuration_that_its_schema_does_not_know(
+    made: Path, verify: Any
+) -> None:
+    path = made / "deployment.json"
+    known = json.loads(path.read_text())
+    path.write_text(json.dumps(known | {"layers": [{"layer": "*", "precision": "fp8"}]}))
+    refused(verify(made), 1, "deployment.json", "layers.0.precision")
 
 
 def test_what_verify_py_finds_fails_the_command(verify: Any, made: Path) -> None:
