@@ -58,9 +58,9 @@ TARGET = Target(
     title="OpenVINO",
     tolerances={
         "fp32": Tolerance(0.01, 0.1, 0.999),
-        "bf16": Tolerance(1.0, 10.0, 0.9),
+        "bf16": Tolerance(0.5, 5.0, 0.95),
         "fp16": Tolerance(0.1, 1.0, 0.99),
-        "int8": Tolerance(1.0, 10.0, 0.9),
+        "int8": Tolerance(0.5, 5.0, 0.95),
     },
     make=make,
     next_step="python3 verify.py",

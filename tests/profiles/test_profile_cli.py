@@ -314,7 +314,9 @@ def test_another_machine_is_told_on_stderr_alone(run: Any, exact: Profile, tmp_p
 
 
 @pytest.mark.usefixtures("made_up")
-def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, device_alone: Path, tmp_path: Path) -> None:
+def test_fit_spends_its_budget_and_writes_a_profile_that_loads(
+    run: Any, device_alone: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "new" / "my-cpu.json"
     asked = ("fit", "--device", device_alone, "--threads", 1, "--out", path)
     found = run(*asked, "--budget", 40, "--json").json
@@ -336,7 +338,9 @@ def test_fit_spends_its_budget_and_writes_a_profile_that_loads(run: Any, device_
 
 
 @pytest.mark.usefixtures("made_up")
-def test_a_budget_that_is_too_small_keeps_its_timings_and_goes_on(run: Any, device_alone: Path, tmp_path: Path) -> None:
+def test_a_budget_that_is_too_small_keeps_its_timings_and_goes_on(
+    run: Any, device_alone: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "x.json"
     asked = ("fit", "--device", device_alone, "--threads", 1, "--out", path)
     said = "reliable timings are too few for tables of parts, which need 24"
@@ -562,7 +566,17 @@ def test_a_killed_fit_goes_on_from_its_samples_and_repeats_none(
     path, journal = tmp_path / "x.json", tmp_path / "x.timings.json"
     truth = tmp_path / "truth.json"
     truth.write_text(made_up.truth.model_dump_json())
-    asked = ["fit", "--device", str(device_alone), "--threads", "1", "--budget", "24", "--out", str(path)]
+    asked = [
+        "fit",
+        "--device",
+        str(device_alone),
+        "--threads",
+        "1",
+        "--budget",
+        "24",
+        "--out",
+        str(path),
+    ]
     started = subprocess.Popen([sys.executable, "-c", SLOW, str(truth), *asked])
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and started.poll() is None:

@@ -15,7 +15,7 @@ import torch
 
 from rts2.model.arch import Arch, Precision
 from rts2.model.checkpoint import build
-from rts2.profiles.profile import PrecisionSupport, Profile, Runtime, RuntimeSupport, load
+from rts2.profiles.profile import Profile, Runtime, load
 from rts2.profiles.trtexec import Generation
 from rts2.search.deploy.bundle import Source, write
 from rts2.search.deploy.configuration import of_point
