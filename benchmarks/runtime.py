@@ -163,7 +163,8 @@ class Bench:
 
     def rows(self, baselines: Sequence[Contender]) -> Iterator[Row]:
         """Every contender in turn, the baselines first."""
-        beside = Reference(self.reference.run)
+        # PyTorch's threads look out for more work for a while, in the next run's way.
+        beside = Reference(self.reference.run, settled=True)
         wanted = TorchPredictor(self.network).predict(self._scene.left, self._scene.right)
         for each in (*baselines, self.reference, *self._others()):
             found = each.predictor.predict(self._scene.left, self._scene.right)

@@ -42,6 +42,7 @@ class Session:
         self._precision = precision
         self._threads = threads
         self._request = self._compiled(profiled=False)[1]
+        self._given: list[NDArray[np.float32]] = []
 
     def run(self) -> None:
         """One pair through the network."""
@@ -53,8 +54,10 @@ class Session:
         """What the graph gives for these inputs, by the names of its outputs."""
         import openvino
 
-        for name, values in inputs.items():
-            self._request.set_tensor(name, openvino.Tensor(np.ascontiguousarray(values)))
+        # Read where they lie: they must live as long as the request knows of them.
+        self._given = [np.ascontiguousarray(values) for values in inputs.values()]
+        for name, values in zip(inputs, self._given, strict=True):
+            self._request.set_tensor(name, openvino.Tensor(values, shared_memory=True))
         self._request.infer()
         return [self._request.get_tensor(name).data.copy() for name in outputs]
 
