@@ -160,11 +160,14 @@ def test_the_json_is_the_configuration(run: Any, front: Callable[..., Path]) -> 
     assert ended.json["expected"]["evidence"]["latency"] == "interpolated"
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
 def test_the_front_of_a_real_search_is_deployed(
-    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], runtime: str
 ) -> None:
+    if runtime == "openvino":
+        pytest.importorskip("openvino", reason="needs OpenVINO: pip install 'rts2[openvino]'")
     asked = ("--device", "cpu", "--target-fps", "30", "--resolution", "640x192", "--task", "stereo")
-    limit = ("--max-size-mb", "0.1", "--json")
+    limit = ("--max-size-mb", "0.1", "--runtime", runtime, "--json")
     assert search([*asked, *limit, "--out", str(tmp_path / "found")]) == 0
     selected = json.loads(capsys.readouterr().out)["selected"]
     path = tmp_path / "found" / "front.json"
