@@ -163,8 +163,7 @@ class Bench:
 
     def rows(self, baselines: Sequence[Contender]) -> Iterator[Row]:
         """Every contender in turn, the baselines first."""
-        # PyTorch's threads look out for more work for a while, in the next run's way.
-        beside = Reference(self.reference.run, settled=True)
+        beside = Reference(self.reference.run, settle_s=0.0)
         wanted = TorchPredictor(self.network).predict(self._scene.left, self._scene.right)
         for each in (*baselines, self.reference, *self._others()):
             found = each.predictor.predict(self._scene.left, self._scene.right)

@@ -53,12 +53,13 @@ PATIENCE: Final = 8
 class Reference:
     """A network beside which others are timed, and its own speed.
 
-    A small one is `settled`: it runs twice, and the second run counts. What runs in between pushes
-    its data out of the caches, which slows the first run by up to a fifth, as others would.
+    A small one settles first: it runs once for nothing, and on until `settle_s` have passed. What
+    runs in between pushes its data out of the caches, which slows the first run by up to a fifth,
+    as others would; and threads of PyTorch look out for more work for a while.
     """
 
-    def __init__(self, run: Callable[[], None], settled: bool = False) -> None:
-        self._run, self._settled = run, settled
+    def __init__(self, run: Callable[[], None], settle_s: float | None = None) -> None:
+        self._run, self._settle_s = run, settle_s
         self._times_ms: list[float] = []
 
     def warm_up(self) -> None:
@@ -73,8 +74,11 @@ class Reference:
 
     def time_ms(self) -> float:
         """One run."""
-        if self._settled:
+        if self._settle_s is not None:
+            started = perf_counter()
             self._run()
+            while perf_counter() - started < self._settle_s:
+                self._run()
         self._times_ms.append(_once_ms(self._run))
         return self._times_ms[-1]
 

@@ -41,9 +41,11 @@ class Clock:
 
         return run
 
-    def reference(self, seconds: Callable[[int], float], settled: bool = False) -> Reference:
+    def reference(
+        self, seconds: Callable[[int], float], settle_s: float | None = None
+    ) -> Reference:
         """A reference like `network`, named r."""
-        return Reference(self.network("r", seconds), settled)
+        return Reference(self.network("r", seconds), settle_s)
 
 
 @pytest.fixture
@@ -98,17 +100,18 @@ def test_the_warm_up_is_not_counted(clock: Clock) -> None:
     assert found.reference_ms == pytest.approx(200)
 
 
-def test_of_a_settled_reference_the_second_run_counts(clock: Clock) -> None:
-    """The first finds the caches as the network left them: twice as slow, yet all is quiet."""
+def test_a_reference_that_settles_is_timed_once_it_has(clock: Clock) -> None:
+    """The first run finds the caches as the network left them: twice as slow, yet all is quiet."""
 
     def cooled(_: int) -> float:
         return 1 / 32 if clock.calls[-1] == "a" else 1 / 64
 
-    for settled, reference_ms in ((False, 1000 / 32), (True, 1000 / 64)):
+    for settle_s, runs, ms in ((None, 1, 1000 / 32), (0, 2, 1000 / 64), (1 / 16, 4, 1000 / 64)):
         clock.calls.clear()
-        found = measure(clock.network("a", lambda _: 1 / 32), clock.reference(cooled, settled))
-        assert found.quiet is settled
-        assert found.reference_ms == reference_ms
+        found = measure(clock.network("a", lambda _: 1 / 32), clock.reference(cooled, settle_s))
+        assert found.quiet is (settle_s is not None)
+        assert found.reference_ms == ms
+        assert clock.calls[-runs - 1 :] == ["a", *["r"] * runs]
 
 
 def test_a_hiccup_moves_the_95th_percentile_and_neither_median_nor_spread(clock: Clock) -> None:
