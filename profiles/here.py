@@ -10,6 +10,9 @@ from typing import Final
 from ..model.machine import processor
 from .profile import Machine
 
+MISSING: Final = "none"
+"""The version of a package that is not installed."""
+
 PACKAGES: Final = ("rts2", "onnxruntime", "openvino", "torch")
 """What a machine's versions name that is installed, or not; other names are no packages."""
 
@@ -55,7 +58,8 @@ def changed(machine: Machine, name: str) -> str | None:
     then, now = machine.versions.get(name), installed(name)
     if then is None or now is None or _public(now) == _public(then):
         return None
-    return f"the profile was fitted with {name} {then}, not {now}"
+    instead = "which is not installed" if now == MISSING else f"not {now}"
+    return f"the profile was fitted with {name} {then}, {instead}"
 
 
 def installed(name: str) -> str | None:
@@ -67,7 +71,7 @@ def installed(name: str) -> str | None:
     try:
         return version(name)
     except PackageNotFoundError:
-        return "none"
+        return MISSING
 
 
 def _public(number: str) -> str:

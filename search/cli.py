@@ -29,14 +29,14 @@ from ..model.console import (
 from ..model.errors import NothingFeasible, UsageError
 from ..model.files import existing_file, output_folder, remove, write_bytes, write_json
 from ..model.machine import cores
-from ..profiles.here import differences
+from ..profiles.here import MISSING, differences, installed
 from ..profiles.profile import Profile, Runtime, load, names
 from .accuracy import AccuracySource
 from .deploy.cli import deploy
 from .deploy.configuration import of_point
 from .exhaustive import Question
 from .exhaustive import search as search_all
-from .result import Cost, Found, Task
+from .result import Cost, Found, Point, Task
 from .sources import source
 from .supernet import supernet
 
@@ -61,6 +61,7 @@ def search(arguments: Sequence[str] | None = None) -> int:
     else:
         found, known = _measured(options, question, weights)
     _warn_of_differences(profile, options.device)
+    _warn_of_missing(profile, found.selected)
     written = _write(found, question, known, out)
     if options.json:
         print_json(found.model_dump(mode="json", by_alias=True))
@@ -183,8 +184,25 @@ def _warn_of_differences(profile: Profile, device: str) -> None:
     if told:
         text = "note: rts2-profile fit --device %s --out FILE.json times this machine as it is%s"
         runtimes = list(dict.fromkeys(known.runtime for known in profile.calibrations))
-        each = f", once with each --runtime: {', '.join(runtimes)}" if len(runtimes) > 1 else ""
-        logging.getLogger(__name__).warning(text, device, each)
+        further = (
+            f"; --device FILE.json --runtime {r} --out FILE.json adds it" for r in runtimes[1:]
+        )
+        logging.getLogger(__name__).warning(text, device, "".join(further))
+
+
+def _warn_of_missing(profile: Profile, pick: Point | None) -> None:
+    """That the pick runs in what is not installed, if the device is a machine at hand."""
+    if profile.machine is None or pick is None or installed(pick.runtime) != MISSING:
+        return
+    from ..profiles.runtimes import RUNTIMES
+
+    runtimes = dict.fromkeys(known.runtime for known in profile.calibrations)
+    others = [f"--runtime {name}" for name in runtimes if installed(name) != MISSING]
+    logging.getLogger(__name__).warning(
+        "note: the pick needs what is missing here: %s%s",
+        RUNTIMES[pick.runtime].missing(),
+        f"; {' or '.join(others)} searches without" if others else "",
+    )
 
 
 def _search_parser() -> argparse.ArgumentParser:

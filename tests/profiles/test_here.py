@@ -57,7 +57,9 @@ def test_a_package_that_is_gone_is_told_and_what_is_none_is_not_compared(
     versions = {"openvino": "2024.6", "cuda": "12.8", "gpu": "a large one"}
     before = machine(versions=versions)
     monkeypatch.setattr(here, "version", gone)
-    assert differences(before, 2) == ["the profile was fitted with openvino 2024.6, not none"]
+    assert differences(before, 2) == [
+        "the profile was fitted with openvino 2024.6, which is not installed"
+    ]
 
 
 def test_the_label_of_a_build_is_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -316,6 +316,39 @@ def test_a_profile_of_another_machine_is_searched_with_what_differs(
     assert remedy.startswith(f"note: rts2-profile fit --device {device} --out ")
 
 
+def test_a_pick_in_a_runtime_that_is_missing_names_what_brings_it(
+    two_runtimes: Profile,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In bf16 OpenVINO is the fastest throughout."""
+    from rts2.profiles.runtimes import ov
+    from rts2.search import cli
+
+    device = written(two_runtimes, tmp_path / "x.json")
+    asked = ["--device", device, "--target-fps", "40", "--json", "--out", str(tmp_path / "out")]
+    said = (
+        "note: the pick needs what is missing here: OpenVINO is not installed; "
+        "pip install 'rts2[openvino]' brings it; --runtime onnxruntime searches without"
+    )
+    for missing in (False, True):
+        monkeypatch.setattr(ov, "find_spec", lambda _, gone=missing: None if gone else object())
+        monkeypatch.setattr(
+            cli,
+            "installed",
+            lambda name, gone=missing: "none" if gone and name == "openvino" else "1",
+        )
+        caplog.clear()
+        assert search([*asked, "--runtime", "onnxruntime"]) == 0
+        capsys.readouterr()
+        assert said not in caplog.text
+        assert search(asked) == 0
+        assert json.loads(capsys.readouterr().out)["selected"]["runtime"] == "openvino"
+        assert (said in caplog.text) is missing
+
+
 def shipped() -> dict[str, Any]:
     text = (resources.files("rts2.profiles") / "devices" / "tx2.json").read_text("utf-8")
     found: dict[str, Any] = json.loads(text)
