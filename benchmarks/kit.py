@@ -56,8 +56,8 @@ PRIOR = LatencyModel(
     },
 )
 """50 multiply-adds a nanosecond (one unit of 16 lanes at 3 GHz), 10 bytes a nanosecond, a number
-gathered by itself in 4 cycles; what comes on top for resizing and for the best class, no data sheet
-tells."""
+gathered by itself in about 4 cycles; what comes on top for resizing and for the best class, no data
+sheet tells."""
 
 
 def stranger() -> Profile:

@@ -120,6 +120,13 @@ def worst(metric: Metric, changes: Sequence[float | None]) -> float | None:
     return (max if LOWER_IS_BETTER[metric] else min)(known, default=None)
 
 
+def lowered(half: bool) -> str:
+    """What was judged, in words."""
+    runtimes = "the worse of ONNX Runtime and OpenVINO" if half else "ONNX Runtime"
+    integers = f"int8 (usual layers, percentile, {PAIRS} pairs; {runtimes})"
+    return f"{integers} and bf16 (OpenVINO)" if half else integers
+
+
 def main() -> None:
     """Prints a row a network, or writes them."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -142,9 +149,8 @@ def main() -> None:
         "schema": "rts2.lowered/1",
         "protocol": (
             f"the networks in the box, cut to each stage count and variant, on {len(frames)} "
-            f"generated scenes of {SIZE[0]}x{SIZE[1]} kept for judging, in int8 (usual layers, "
-            f"percentile, {PAIRS} pairs; the worse of ONNX Runtime and OpenVINO) and bf16 "
-            f"(OpenVINO) against fp32 (ONNX Runtime); {processor()}, {date.today().isoformat()}"
+            f"generated scenes of {SIZE[0]}x{SIZE[1]} kept for judging, in {lowered(half)} against "
+            f"fp32 (ONNX Runtime); {processor()}, {date.today().isoformat()}"
         ),
         "rows": rows,
     }

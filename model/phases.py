@@ -26,7 +26,7 @@ class Phases(NamedTuple):
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Of the second kernel, which finds three pixels in as many groups as they lie in."""
+        """Of the second kernel: three pixels lie in three groups of one, or in two of two."""
         return 3 if self.y == 1 else 2, 3 if self.x == 1 else 2
 
     def of(self, maps: Shape) -> Shape:

@@ -125,7 +125,7 @@ branches), with channels filled up to blocks (2D: inputs and outputs, 3D: output
 bytes moved, of those by resizing and by finding the best class; 10⁶ voxels of residual volumes;
 kernels of a step beyond its first.
 
-As ONNX Runtime computes the graphs that `rts2.model.export` writes on a CPU: `gmac_2d_packed` in
-blocks of channels, inputs only from a whole block on, `gbyte_repacked` copied into blocks and out;
-`gmac_product` as products of matrices, which are 3D convs, and 2D convs whose inputs cannot be
-packed; `gbyte_columns` laid out for those, `gbyte_strided` number by number."""
+Of few-shot fits (`kit`), as ONNX Runtime computes the graphs of `rts2.model.export` on a CPU:
+`gmac_2d_packed` in blocks of channels, inputs only from a whole block on, `gbyte_repacked` copied
+into blocks and out; `gmac_product` as products of matrices, which are 3D convs, and 2D convs whose
+inputs cannot be packed; `gbyte_columns` laid out for those, `gbyte_strided` number by number."""

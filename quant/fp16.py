@@ -34,8 +34,8 @@ Role = Literal["soft-argmin", "disparity", "coordinate"]
 
 REASONS: Final[dict[Role, str]] = {
     "soft-argmin": "soft-argmin: its weights must add up to one",
-    "disparity": "disparity in pixels: from 128 px on, fp16 steps by 1/8 px",
-    "coordinate": "warp coordinate: from 256 px on, fp16 steps by 1/4 px",
+    "disparity": "disparity in pixels: from 128 px on, half precision steps by 1/8 px or more",
+    "coordinate": "warp coordinate: from 256 px on, half precision steps by 1/4 px or more",
 }
 
 

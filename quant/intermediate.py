@@ -73,7 +73,7 @@ def _anchored(model: Any, kept: set[str]) -> set[str]:
         readers = [
             each
             for each in node.output(0).get_target_inputs()
-            if each.get_node().get_type_name() != "Result"  # it is called as the operator before it
+            if each.get_node().get_type_name() != "Result"  # it bears this operator's name
         ]
         lowest = opset8.constant(LOWEST, name=f"{name}/lowest")
         anchor = opset8.maximum(node, lowest, name=f"{name}/kept")
@@ -84,8 +84,8 @@ def _anchored(model: Any, kept: set[str]) -> set[str]:
 
 
 def _precise(layers: dict[str, Any], edges: Iterable[Any], kept: set[str]) -> set[str]:
-    """The layers to mark: those of these names, what an operator of the file became beside them,
-    and what makes whole numbers of theirs.
+    """The layers to mark: those of these names, what stands between two of them (one operator of
+    the file may become several), and the conversions to whole numbers behind them.
     """
     sources, readers = defaultdict(set), defaultdict(set)
     for edge in edges:

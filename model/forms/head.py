@@ -38,7 +38,7 @@ def class_ids_by_maxima(scores: Tensor, factor: int) -> Tensor:
     """
     classes = scores.shape[1]
     left = torch.arange(classes, 0, -1, dtype=scores.dtype, device=scores.device).view(-1, 1, 1)
-    # With five sides the frame is no picture whose channels a compiler may lay side by side.
+    # Framed with five axes: of four OpenVINO may lay the channels side by side, and all back.
     planes = _framed(_framed(scores.unsqueeze(1), 3), 4).squeeze(1)
     height = planes.shape[2] - 1
     down = _between(planes, 2, factor)

@@ -51,7 +51,7 @@ class Session:
     def answer(
         self, outputs: Sequence[str], inputs: Mapping[str, NDArray[np.float32]]
     ) -> list[NDArray[Any]]:
-        """What the graph gives for these inputs, by the names of its outputs."""
+        """What the graph gives for these inputs, arrays that can be written, by its outputs."""
         import openvino
 
         # Read where they lie: they must live as long as the request knows of them.

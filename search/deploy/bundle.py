@@ -94,7 +94,7 @@ def write(
         Rts2Error: the graph has operators that the device's runtime does not take, or its
             output is not the network's.
     """
-    support = runtime_of(profile, deployment.runtime)
+    support = runtime_of(profile, deployment.runtime, deployment.precision)
     target = TARGETS[support.runtime]
     _refuse(deployment, profile, support, target, generation)
     known = triton.model(deployment.arch, support.runtime) if for_triton else None
@@ -158,7 +158,7 @@ def _refuse(
     if precision not in target.tolerances:
         raise UsageError(
             f"a bundle for {profile.title} runs {' or '.join(target.tolerances)} on "
-            f"{support.runtime}, not {precision}; rts2-quantize makes such a graph"
+            f"{support.runtime}, not {precision}; {_instead(profile, precision)}"
         )
     refusal = profile.refusal(precision)
     if refusal is not None:
@@ -167,6 +167,14 @@ def _refuse(
         trt.generation_of(profile, support, generation)
     elif generation is not None:
         raise UsageError(f"--tensorrt is for TensorRT; this bundle runs on {target.title}")
+
+
+def _instead(profile: Profile, precision: Precision) -> str:
+    """What brings a precision that a runtime does not have."""
+    other = runtime_of(profile, precision=precision).runtime
+    if precision in TARGETS[other].tolerances and profile.refusal(precision) is None:
+        return f"--runtime {other} has it"
+    return "rts2-quantize makes such a graph"
 
 
 def _export(

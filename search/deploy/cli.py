@@ -131,7 +131,7 @@ def _deploy_parser() -> argparse.ArgumentParser:
     add("--resolution", type=resolution, metavar="WxH", help=text)
     text = "without a front: what the network is computed in (default: fp32)"
     add("--precision", choices=get_args(Precision), help=text)
-    text = "without a front: what computes it (default: the device's first that a bundle can run)"
+    text = "without a front: what computes it (default: the device's first that has the precision)"
     add("--runtime", choices=tuple(TARGETS), help=text)
     text = "the generation of TensorRT that the device has (default: the profile's)"
     add("--tensorrt", choices=GENERATIONS, help=text)

@@ -37,7 +37,7 @@ class Lowered:
 def lower(path: Path, symmetric: bool = False) -> Lowered:
     """Makes the float graph at `path` one in 8 bits, in its place.
 
-    Layers are chosen as the latency was timed in ONNX Runtime; `symmetric` is for TensorRT, with
+    Layers are chosen as the latency was timed on CPUs; `symmetric` is for TensorRT, with
     zero points of 0, the layers those that nobody has to time.
     """
     model, header = opened(path)

@@ -23,9 +23,7 @@ IN_INTEGERS: Final = "a convolution that is usually worth it: weights and inputs
 
 def halved(precision: Precision, kept: Sequence[Kept]) -> tuple[LayerPrecision, ...]:
     """Half precision throughout, but for what carries a disparity."""
-    others = LayerPrecision(
-        layer=OTHERS, precision=precision, reason="half precision was asked for"
-    )
+    others = LayerPrecision(layer=OTHERS, precision=precision, reason=HALVED)
     return (others, *precise(kept))
 
 

@@ -61,6 +61,18 @@ def test_a_bundle_that_is_well_is_told_with_both_frame_rates(
     assert not list(folder.glob("*.log"))
 
 
+def test_what_is_slower_than_promised_is_told(copied: Maker, checked: Callable[..., Any]) -> None:
+    folder = copied("cpu", "onnxruntime", "fp32")
+    path = folder / "deployment.json"
+    known = json.loads(path.read_text())
+    for low, slow in ((1e-3, False), (1e9, True)):
+        known["expected"]["fps_low"] = low
+        path.write_text(json.dumps(known))
+        told = json.loads(checked(folder, "--json").stdout)
+        assert told["ok"]
+        assert any("slower than promised" in note for note in told["notes"]) is slow
+
+
 def test_for_machines_it_is_one_object(copied: Maker, checked: Callable[..., Any]) -> None:
     ended = checked(copied(*CPU), "--json")
     assert (ended.returncode, ended.stderr, ended.stdout.count("\n")) == (0, "", 1)
