@@ -67,22 +67,27 @@ def headline(found: Found, title: str) -> str:
 
 def scope(found: Found) -> str:
     """How much was searched, and how long that took."""
-    return f"{found.space.size:,} candidates, every one, in {found.elapsed_s:.1f} s"
+    judged = "every one" if found.cost is None else f"{found.cost.evaluations:,} chains judged"
+    return f"{found.space.size:,} candidates, {judged}, in {found.elapsed_s:.1f} s"
 
 
-def remarks(found: Found, profile: Profile) -> list[tuple[str, str]]:
+def remarks(found: Found, profile: Profile, folder: str = "") -> list[tuple[str, str]]:
     """The pick, the prospect, the cost, what was left out and the notes, each with its label.
 
-    A label that is empty goes on with the one before it.
+    A label that is empty goes on with the one before it. `folder` is where the front is written.
     """
-    return [*_verdict(found), *_cost(found), *_left_out(found), *_notes(found, profile)]
+    return [*_verdict(found, folder), *_cost(found), *_left_out(found), *_notes(found, profile)]
 
 
 def show(found: Found, profile: Profile, written: Sequence[str], console: Console) -> None:
-    """Prints the table of the front, the pick, the prospect, and what was left out."""
+    """Prints the table of the front, the pick, the prospect, and what was left out.
+
+    The folder stands first in `written`.
+    """
     console.print(Text(f"{headline(found, profile.title)} · {scope(found)}\n"))
     console.print(_table(found, console.width))
-    for label, text in [*remarks(found, profile), ("written", "  ".join(written))]:
+    told = remarks(found, profile, written[0])
+    for label, text in [*told, ("written", "  ".join(written))]:
         row = Table.grid(padding=(0, 2))
         row.add_column(width=9)
         row.add_column(overflow="fold")
@@ -198,7 +203,7 @@ def _thinned(points: list[Point], found: Found) -> list[Point]:
     return [points[i] for i in sorted(near | spread)]
 
 
-def _verdict(found: Found) -> list[tuple[str, str]]:
+def _verdict(found: Found, folder: str) -> list[tuple[str, str]]:
     lines = [("pick", _sentence(found, found.selected) if found.selected else _no_pick(found))]
     prospect = found.prospect
     if prospect is not None and prospect != found.selected:
@@ -208,8 +213,8 @@ def _verdict(found: Found) -> list[tuple[str, str]]:
             accuracy += " (extrapolated)"
         told = f"{name_of(prospect)} · {prospect.fps:.1f} FPS ({doubt}) · {accuracy}"
         remedy = (
-            f"rts2-deploy --front front.json --prospect --untrained --device {found.device} writes "
-            "what times it there; --allow-extrapolated takes it"
+            f"rts2-deploy --front {folder}front.json --prospect --untrained --device "
+            f"{found.device} writes what times it there; --allow-extrapolated takes it"
         )
         lines += [("prospect", told), ("", remedy)]
     return [*lines, *_untried(found)]

@@ -142,6 +142,7 @@ def test_without_json_there_is_a_table(run: Command) -> None:
     assert "Jetson TX2" in done.out
     assert sum("▶" in line for line in done.out.splitlines()) == 1
     assert all(name in done.out for name in FILES)
+    assert f"--front{done.folder}/front.json--prospect" in "".join(done.out.split())
 
 
 def test_the_files_agree_with_one_another(run: Command) -> None:

@@ -54,6 +54,7 @@ def test_the_pick_its_weights_and_the_cost(
     assert header.origin.startswith("cut out of a supernet (a test), norms calibrated on streets")
     assert search(arguments) == 0
     again = capsys.readouterr().out
+    assert "candidates, 2 chains judged, in " in again
     assert "2 of 2 chains judged (0 in this run" in again
     assert "the supernet trained 90 s" in again
     front = ("--front", str(out / "front.json"), "--model", str(out / "pick.safetensors"))
