@@ -88,21 +88,18 @@ class _Made:
         path = self.folder / f"{runtime}.onnx"
         network, header = load(named_model(self.name))
         forms = ("banded",) * self.arch.stages
-        whole = cut(network, self.arch)
-        export(whole, path, SIZE, header.origin, forms=forms, runtime=runtime)
+        part = cut(network, self.arch)
+        export(part, path, SIZE, header.origin, forms=forms, runtime=runtime)
         model, told = opened(path)
         known = calibrate(model, told, self.pairs, path.with_suffix(".npz"))
         lowered = path.with_name(f"{runtime}-int8.onnx")
-        update = {"precision": "int8"}
         made = integers(model, usual(model), known.ranges("percentile"))
-        save_graph(made, told.model_copy(update=update), lowered)
+        save_graph(made, told.model_copy(update={"precision": "int8"}), lowered)
         return path, lowered
 
 
 def _compiled(graph: Path, precision: Precision) -> OpenVinoPredictor:
-    path = graph.with_suffix(".xml")
-    to_ir(graph, path)
-    return OpenVinoPredictor(graph, path, precision, cores())
+    return OpenVinoPredictor(graph, to_ir(graph), precision, cores())
 
 
 def change(before: Score, after: Score) -> dict[str, float | None]:

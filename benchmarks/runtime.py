@@ -179,9 +179,10 @@ class Bench:
             return
         graph, lowered = self._graph("openvino"), self._integers("openvino")
         yield self._openvino(graph, graph, "fp32")
-        yield self._openvino(lowered, _own_format(lowered), "int8")
+        yield self._openvino(lowered, to_ir(lowered), "int8")
+        compiled = to_ir(graph)
         for precision in precisions("openvino")[1:]:
-            yield self._openvino(graph, _own_format(graph), precision)
+            yield self._openvino(graph, compiled, precision)
 
     def _graph(self, runtime: str) -> Path:
         """The float graph in the forms that a runtime is fastest at."""
@@ -210,13 +211,6 @@ class Bench:
         predictor = OpenVinoPredictor(graph, compiled, precision, cores())
         told = _conv_ms(session, graph)
         return Contender(f"OpenVINO {precision}", precision, session.run, predictor, told)
-
-
-def _own_format(graph: Path) -> Path:
-    """The graph as OpenVINO has it, where half precision spares what carries disparities."""
-    path = graph.with_suffix(".xml")
-    to_ir(graph, path)
-    return path
 
 
 def _conv_ms(session: Any, path: Path) -> Callable[[], float]:

@@ -81,9 +81,7 @@ def quantize(
     graphs = {forms: source.graph(forms or None) for forms in source.forms or ((),)}
     plain = _fastest([Runner(path, "fp32") for path in graphs.values()], threads)
     suited = [source.graph(forms or None, RUNTIME) for forms in graphs]
-    lowered = {path.with_suffix(".xml"): path for path in suited}
-    for compiled, path in lowered.items():
-        to_ir(path, compiled)
+    lowered = {to_ir(path): path for path in suited}
     own = _fastest([Runner(compiled, precision, RUNTIME) for compiled in lowered], threads)
     graph = lowered[own.path]
     other = OpenVinoPredictor(graph, own.path, precision, threads)

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..model.files import write_bytes
+from ..profiles.runtimes.ov import IR
 from .fp16 import kept_float
 from .source import opened
 
@@ -33,13 +34,14 @@ FORGETFUL: Final = frozenset(("Subtract", "Divide"))
 LOWEST: Final = np.finfo(np.float32).min
 
 
-def to_ir(graph: Path, path: Path) -> None:
-    """Writes the graph as OpenVINO IR: `path` (.xml), and its weights beside it (.bin).
+def to_ir(graph: Path) -> Path:
+    """Writes the graph as OpenVINO IR beside it: the file that is returned, and its weights (.bin).
 
     Equal graphs give equal bytes.
     """
     import openvino
 
+    path = graph.with_suffix(IR)
     kept = {layer for layer, _ in kept_float(opened(graph)[0])}
     model = openvino.Core().read_model(str(graph))
     kept |= _anchored(model, kept)
@@ -55,6 +57,7 @@ def to_ir(graph: Path, path: Path) -> None:
                 layer.set("name", f"{layer.get('type')}_{each}")
         write_bytes(path.with_suffix(".bin"), plain.with_suffix(".bin").read_bytes())
         write_bytes(path, ElementTree.tostring(tree.getroot(), "utf-8", xml_declaration=True))
+    return path
 
 
 def _anchored(model: Any, kept: set[str]) -> set[str]:

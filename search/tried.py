@@ -155,9 +155,7 @@ class _Graphs:
         path = self.lowered(size) if self.point.precision == "int8" else self.float(size)
         if self.point.runtime != "openvino":
             return OnnxPredictor(path)
-        compiled = path.with_suffix(".xml")
-        to_ir(path, compiled)
-        return OpenVinoPredictor(path, compiled, self.point.precision, self.trials.threads)
+        return OpenVinoPredictor(path, to_ir(path), self.point.precision, self.trials.threads)
 
     @cached_property
     def _ranges(self) -> Ranges:

@@ -16,7 +16,7 @@ precision without a word where the processor lacks the one that it was told: set
 
 def make(order: Order) -> Made:
     """Writes OpenVINO's own format for lower precisions; fp32 runs the graph itself."""
-    from ...profiles.runtimes.ov import HINTS, IR, missing
+    from ...profiles.runtimes.ov import HINTS, missing
     from ...quant.fp16 import kept_float
     from ...quant.intermediate import to_ir
     from ...quant.source import opened
@@ -36,9 +36,7 @@ def make(order: Order) -> Made:
     if reason is not None:
         raise Rts2Error(f"a bundle in {precision} holds OpenVINO's own format: {reason}")
     lowered = lower(order.graph) if precision == "int8" else None
-    path = order.graph.with_suffix(IR)
-    to_ir(order.graph, path)
-    execution = OpenVinoExecution(file=path.name, properties=properties)
+    execution = OpenVinoExecution(file=to_ir(order.graph).name, properties=properties)
     kept = kept_float(opened(order.graph)[0]) if floats != "fp32" else ()
     if lowered is None:
         return Made(execution, halved(floats, kept))
