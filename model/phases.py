@@ -9,6 +9,7 @@ from typing import NamedTuple
 from .ops import Op, Shape
 
 BLOCK = 16
+"""Single-precision channels in one AVX-512 register: CPU kernels compute whole blocks."""
 
 STEM = ("encoder.stem.0.conv", "encoder.stem.1.conv")
 """Its two convs in the op list."""

@@ -7,10 +7,7 @@ from math import prod
 from typing import Final
 
 from ..model.ops import BYTES_PER_ELEMENT, Kind, Op, Shape
-from ..model.phases import widened
-
-CHANNEL_BLOCK: Final = 16
-"""Single-precision channels in one AVX-512 register: CPU kernels compute whole blocks."""
+from ..model.phases import BLOCK, widened
 
 REORDERED: Final = 4
 """Channels that are copied into blocks at a time: other counts of inputs are not packed."""
@@ -33,14 +30,15 @@ def _single(op: Op) -> float:
 def _blocked(op: Op, kind: Kind) -> float:
     """Multiply-adds of a convolution on whole blocks of channels; an image's three stay three."""
     inputs, outputs = op.inputs[0][1], op.output[1]
-    filled = _whole_blocks(outputs) / outputs
+    filled = _filled(outputs)
     if kind == "conv2d" and inputs > IMAGE_CHANNELS:
-        filled *= _whole_blocks(inputs) / inputs
+        filled *= _filled(inputs)
     return _macs(op, kind) * filled
 
 
-def _whole_blocks(channels: int) -> int:
-    return -(-channels // CHANNEL_BLOCK) * CHANNEL_BLOCK
+def _filled(channels: int) -> float:
+    """How many times as many channels are computed as there are."""
+    return -(-channels // BLOCK) * BLOCK / channels
 
 
 def _is_packed(op: Op) -> bool:
@@ -48,12 +46,12 @@ def _is_packed(op: Op) -> bool:
     whole block of them.
     """
     inputs = op.inputs[0][1]
-    return op.kind == "conv2d" and (inputs < CHANNEL_BLOCK or inputs % REORDERED == 0)
+    return op.kind == "conv2d" and (inputs < BLOCK or inputs % REORDERED == 0)
 
 
 def _is_product(op: Op) -> bool:
     """Whether a convolution is a product of matrices, its windows laid out in columns before."""
-    return op.macs > 0 and op.kind in ("conv2d", "conv3d") and not _is_packed(op)
+    return op.kind in ("conv2d", "conv3d") and not _is_packed(op)
 
 
 def _packed(op: Op) -> float:
@@ -62,9 +60,9 @@ def _packed(op: Op) -> float:
     if not _is_packed(own):
         return 0.0
     inputs, outputs = own.inputs[0][1], own.output[1]
-    filled = _whole_blocks(outputs) / outputs
-    if inputs >= CHANNEL_BLOCK:
-        filled *= _whole_blocks(inputs) / inputs
+    filled = _filled(outputs)
+    if inputs >= BLOCK:
+        filled *= _filled(inputs)
     return own.macs / 1e9 * filled
 
 
@@ -75,8 +73,8 @@ def _repacked(op: Op) -> float:
     own = widened(op)
     if not _is_packed(own):
         return 0.0
-    maps = (own.output, *(shape for shape in own.inputs if shape[1] > CHANNEL_BLOCK))
-    return _gbytes(*(shape for shape in maps if shape[1] % CHANNEL_BLOCK))
+    maps = (own.output, *(shape for shape in own.inputs if shape[1] > BLOCK))
+    return _gbytes(*(shape for shape in maps if shape[1] % BLOCK))
 
 
 def _product(op: Op) -> float:
