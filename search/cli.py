@@ -31,6 +31,7 @@ from ..model.files import existing_file, output_folder, remove, write_bytes, wri
 from ..model.machine import cores
 from ..profiles.here import MISSING, differences, installed
 from ..profiles.profile import Profile, Runtime, load, names
+from ..profiles.several import others
 from .accuracy import AccuracySource
 from .deploy.cli import deploy
 from .deploy.configuration import of_point
@@ -196,12 +197,13 @@ def _warn_of_missing(profile: Profile, pick: Point | None) -> None:
         return
     from ..profiles.runtimes import RUNTIMES
 
-    runtimes = dict.fromkeys(known.runtime for known in profile.calibrations)
-    others = [f"--runtime {name}" for name in runtimes if installed(name) != MISSING]
+    instead = [
+        f"--runtime {name}" for name in others(profile, pick.runtime) if installed(name) != MISSING
+    ]
     logging.getLogger(__name__).warning(
         "note: the pick needs what is missing here: %s%s",
         RUNTIMES[pick.runtime].missing(),
-        f"; {' or '.join(others)} searches without" if others else "",
+        f"; {' or '.join(instead)} searches without" if instead else "",
     )
 
 
