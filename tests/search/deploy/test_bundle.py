@@ -375,7 +375,10 @@ def test_without_a_runtime_the_first_that_has_the_precision_is_taken(ort_alone: 
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        (("cpu", "onnxruntime", "bf16"), "not bf16; --runtime openvino has it"),
+        (
+            ("cpu", "onnxruntime", "bf16"),
+            "runs fp32 or int8 on onnxruntime, not bf16; --runtime openvino has it",
+        ),
         (("cpu", "onnxruntime", "fp16"), "not fp16; rts2-quantize makes such a graph"),
         (("tx2", "tensorrt", "int8"), "Jetson TX2 does not run int8: sm_62 has no DP4A"),
     ],
