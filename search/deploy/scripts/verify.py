@@ -366,12 +366,14 @@ def main():
     asked = options.parse_args()
     try:
         told = verified(asked.save_optimized)
+        if asked.json:
+            print(json.dumps(told))
+        else:
+            show(told)
     except Fault as fault:
         sys.exit(str(fault))
-    if asked.json:
-        print(json.dumps(told))
-    else:
-        show(told)
+    except KeyError as missing:
+        sys.exit("deployment.json lacks {}: copy it again".format(missing))
     if not told["ok"]:
         far = ", ".join(row["name"] for row in told["pairs"] if not row["ok"])
         sys.exit("FAILED: the answers are too far off on " + far)

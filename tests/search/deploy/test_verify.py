@@ -152,6 +152,21 @@ def test_a_configuration_that_is_none_is_told(
     failed(checked(folder), "deployment.json is no")
 
 
+@pytest.mark.parametrize("name", ["fps_low", "confidence"])
+def test_a_configuration_that_lacks_something_is_told(
+    copied: Maker, checked: Callable[..., Any], name: str
+) -> None:
+    """Told before the check of speed, or while it is printed."""
+    folder = copied(*CPU)
+    path = folder / "deployment.json"
+    known = json.loads(path.read_text())
+    del known["expected"][name]
+    path.write_text(json.dumps(known))
+    ended = checked(folder)
+    assert ended.returncode == 1
+    assert ended.stderr == f"deployment.json lacks '{name}': copy it again\n"
+
+
 def externalize(folder: Path) -> None:
     """The graph's weights in a file of their own."""
     model = onnx.load(folder / "model.onnx")
